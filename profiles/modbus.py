@@ -66,13 +66,18 @@ class StatusState(DataModel):
 
     mask: Word
     value: Word
-    means: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault"] = Field(
+    means: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault", "fault_reaction"] = Field(
         description="off: no torque, no request; ready: on the way; enabled: setpoints act; quick_stop: braking, "
-        "or holding afterwards"
+        "or holding afterwards; fault: no torque; fault_reaction: braking after a fault, or holding: the power stage "
+        "is on"
     )
     onward: Word | None = Field(
         default=None, description="controlword that leads from here towards enabled; null where none does"
     )
+
+
+FAULT_REACTION_ACTIVE = 0x000F
+"""Status word of fault reaction active (CiA 402-2, 6041h); bits 4 to 15 don't matter, except 6, which is 0."""
 
 
 class Control(ProfileEntry):
@@ -101,6 +106,10 @@ class Control(ProfileEntry):
             [("states", f"none means {name}") for name in ("off", "enabled", "fault") if name not in seen]
             + [("states", "none leads onward to enabled") for _ in [0] if all(s.onward is None for s in self.states)]
         )
+        reaction = next((s for s in self.states if FAULT_REACTION_ACTIVE & s.mask == s.value), None)
+        if self.family == "cia402" and reaction is not None and reaction.means == "fault":
+            refuse_if([("states", "000Fh is fault reaction active, and its power stage is on: give a state that means "
+                        "fault_reaction (mask 0x4F, value 0x0F)")])
         return self
 
 

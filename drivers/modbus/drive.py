@@ -578,12 +578,17 @@ class ModbusDrive:
     def _follow_state(self) -> None:
         """Keep a drive that left operation out of it until it is enabled again. Raises DriveFault, once."""
         power = power_state(self._state)
-        if power is PowerState.FAULT:
-            asked, self._wish = self._wish, PowerRequest.OFF
+        if power in (PowerState.FAULT, PowerState.FAULT_REACTION):
+            # In fault reaction the drive brakes, or holds the shaft: it is not disabled before a request for it.
+            asked = self._wish
+            if power is PowerState.FAULT:
+                self._wish = PowerRequest.OFF
+            elif asked is PowerRequest.ENABLED:
+                self._wish = PowerRequest.QUICK_STOP
             if asked is not PowerRequest.OFF and not self._told_fault:
                 self._told_fault = True
                 raise DriveFault(
-                    f"the drive went into fault, status {self._feedback.status:04X}h",
+                    f"the drive went into {power.value}, status {self._feedback.status:04X}h",
                     where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
                     next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
                 )

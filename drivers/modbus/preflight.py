@@ -212,7 +212,7 @@ def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
     still_rad_s = min(max(STILL_COUNTS * scales.speed, STILL_SHARE * speed_limit_rad_s), STANDSTILL_RAD_S)
     turning = abs(speed_rad_s) > still_rad_s
     found = f"{power.value}, status {status:04X}h" + (f", {speed_rad_s:.3g} rad/s" if turning else "")
-    faulty = power is PowerState.FAULT
+    faulty = power in (PowerState.FAULT, PowerState.FAULT_REACTION)
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
     where = f"{register_name(register)}, {register_name(cycle.speed.register_)}"
     known = power is not PowerState.UNKNOWN

@@ -27,7 +27,8 @@ ANGLE_TIMEOUT_S = 0.1
 """Time for one reading of the position, s."""
 MODE_S, MODE_UNTOLD_S = 1.0, 0.3
 """Longest time for the change to speed mode, s: with a mode display, and without."""
-_POWERED = (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.READY)
+_BRAKING = (PowerState.QUICK_STOP, PowerState.FAULT_REACTION, PowerState.READY)
+_POWERED = (PowerState.ENABLED, *_BRAKING)
 
 
 class ModbusTarget:
@@ -124,7 +125,7 @@ class ModbusTarget:
             self._standstill = StandstillTest(self._scale, self._find_position)
         power = power_state(decode(control, status))
         near = self._standstill.near_zero(raw)
-        if not near and self._stops and power in (PowerState.QUICK_STOP, PowerState.READY):
+        if not near and self._stops and power in _BRAKING:
             self._access.write(cycle.control.register_, control.quick_stop | self._speed_bits())
         return Seen(
             state=power,

@@ -60,7 +60,10 @@ _POWER = {
     "enabled": PowerState.ENABLED,
     "quick_stop": PowerState.QUICK_STOP,
     "fault": PowerState.FAULT,
+    "fault_reaction": PowerState.FAULT_REACTION,
 }
+_UNDER_POWER = (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.FAULT_REACTION, PowerState.NOT_READY,
+                PowerState.UNKNOWN)
 
 
 _ALL_ONES = 0xFFFF
@@ -108,9 +111,9 @@ def controlword_towards(
     pattern, do not prove that it is off.
     """
     power = power_state(state)
-    under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY, PowerState.UNKNOWN)
+    under_power = power in _UNDER_POWER
     if wish is PowerRequest.ENABLED:
-        if power is PowerState.QUICK_STOP:
+        if power in (PowerState.QUICK_STOP, PowerState.FAULT_REACTION):
             word = control.quick_stop
         elif state is not None and state.onward is not None and power is not PowerState.FAULT:
             word = state.onward

@@ -736,7 +736,7 @@ def _state(profile: ModbusProfile, word: int) -> DoctorFinding:
     """Return the finding on the state in the status word."""
     state = driver.power_state(driver.decode(profile.control, word))
     said = f"{state.value} (status word {word:04X}h)"
-    if state is PowerState.FAULT:
+    if state in (PowerState.FAULT, PowerState.FAULT_REACTION):
         return bad("state", said, "Remove its cause, then start a run with --reset-fault")
     if state is PowerState.ENABLED:
         return bad("state", f"{said}: another master controls it", "Disable it there first")

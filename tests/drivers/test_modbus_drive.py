@@ -208,6 +208,28 @@ def test_a_fault_is_raised_once_and_never_reset():
     assert not any(word & 0x80 for word in run.controlwords())
 
 
+def test_a_fault_reaction_is_no_fault_yet():
+    """The drive brakes by itself, with its power stage on: the error is raised once, and nothing disables it."""
+    run = Run().enabled()
+    run.bank.feedback = lambda: (3000, 0)
+    run.cycle()
+    run.bank.on_show = lambda words: words.update({STATUS: 0x021F})
+    run.bank.writes.clear()
+    ((_, error),) = errors(run, 20)
+    assert isinstance(error, DriveFault) and "fault reaction, status 021Fh" in error.what
+    assert run.cycle().state is PowerState.FAULT_REACTION
+    run.drive.quick_stop()
+    for _ in range(20):
+        run.cycle()
+    run.drive.disable()
+    run.cycle()
+    words = run.controlwords()
+    assert set(words[1:]) == {0x0002}                 # quick stop; the first one was sent before the state was seen
+    run.bank.on_show = lambda words: words.update({STATUS: 0x0218})
+    assert run.cycle().state is PowerState.FAULT
+    assert not any(word & 0x80 for word in run.controlwords())
+
+
 def test_a_drive_that_fell_out_is_not_enabled_again():
     run = Run().enabled()
     run.bank.machine.state = OFF

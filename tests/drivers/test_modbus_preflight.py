@@ -161,6 +161,13 @@ def test_a_turning_shaft_and_local_control(bank, generic):
     assert bank.writes == []
 
 
+def test_a_fault_reaction_is_refused(bank, generic):
+    bank.on_show = lambda words: words.update({STATUS: 0x021F})
+    row = refused(bank, generic)["state"]
+    assert row.found == "fault reaction, status 021Fh" and "--reset-fault" in row.next_step
+    assert bank.writes == []
+
+
 def test_three_coarse_counts_are_no_standstill(bank, generic):
     """A count of 1 rpm: 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
     bank.feedback = lambda: (3, 0)

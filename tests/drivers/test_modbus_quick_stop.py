@@ -6,7 +6,7 @@ import json
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
 from drivers.modbus.quick_stop import ModbusTarget
@@ -15,7 +15,7 @@ from profiles.library import load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
-from tests.drivers.modbus_bank import MODE, MODE_SHOWN, SPEED_SETPOINT, STATUS, Bank
+from tests.drivers.modbus_bank import CONTROL, MODE, MODE_SHOWN, SPEED_SETPOINT, STATUS, Bank
 from tests.drivers.power_machine import ENABLED, STOPPING
 
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
@@ -100,6 +100,17 @@ def test_a_speed_in_known_units_is_near_zero_below_0_05_rad_s(counts, near):
     bank.feedback = lambda: (counts, 0)
     target = ModbusTarget(EmbeddedLink(bank.serve, clock), load_profile("generic/modbus"), unit=1)
     assert target.poll().near_zero is near
+
+
+def test_a_fault_reaction_has_power_and_is_braked_on():
+    """Its quick-stop word is repeated while the shaft turns: the drive's watchdog might release it."""
+    bank, clock = Bank(), SteppedClock()
+    bank.feedback = lambda: (3000, 0)
+    bank.on_show = lambda words: words.update({STATUS: 0x021F})
+    target = ModbusTarget(EmbeddedLink(bank.serve, clock), load_profile("generic/modbus"), unit=1)
+    target.ask(1)
+    assert target.poll().state is PowerState.FAULT_REACTION
+    assert bank.writes == [(CONTROL, [0x0002])] * 2
 
 
 @pytest.mark.parametrize("refused", [SPEED_SETPOINT, MODE, MODE_SHOWN])

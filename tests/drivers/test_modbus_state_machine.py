@@ -24,7 +24,8 @@ from tests.drivers.power_machine import (
 CONTROL = load_modbus_profile("generic/modbus").control
 POWER = {
     "not ready": PowerState.NOT_READY, OFF: PowerState.OFF, READY: PowerState.READY, ON: PowerState.READY,
-    ENABLED: PowerState.ENABLED, STOPPING: PowerState.QUICK_STOP, REACTION: PowerState.FAULT, FAULT: PowerState.FAULT,
+    ENABLED: PowerState.ENABLED, STOPPING: PowerState.QUICK_STOP, FAULT: PowerState.FAULT,
+    REACTION: PowerState.FAULT_REACTION,
 }
 
 
@@ -63,6 +64,13 @@ def test_a_turning_shaft_is_braked_not_disabled(state):
     machine = PowerMachine(state)
     assert walk(machine, PowerRequest.OFF, turning=True)[-1] == STOPPING
     assert walk(machine, PowerRequest.OFF)[-1] == OFF
+
+
+@pytest.mark.parametrize("wish", list(PowerRequest))
+def test_a_fault_reaction_that_brakes_is_never_switched_off(wish):
+    """CiA 402-2: the power stage is on in fault reaction active, and brakes the shaft."""
+    state = decode(CONTROL, 0x021F)
+    assert controlword_towards(CONTROL, state, wish, Mode.SPEED, turning=True) == CONTROL.quick_stop
 
 
 def test_bits_of_the_mode_and_the_direction_stand_in_every_word():

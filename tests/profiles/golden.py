@@ -59,7 +59,7 @@ Wish = Literal["off", "enabled", "quick_stop"]
 class Means(DataModel):
     """What an exchange says, worked out by hand."""
 
-    state: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault"] | None = None
+    state: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault", "fault_reaction"] | None = None
     remote: bool | None = None
     limit_active: bool | None = None
     standstill: bool | None = None

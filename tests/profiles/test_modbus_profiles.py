@@ -84,7 +84,8 @@ def test_the_words_lead_from_off_to_enabled_and_no_word_is_two_wishes(name: str)
     control = worn(name).control
     onward = {state.means: state.onward for state in control.states if state.onward is not None}
     assert {"off", "enabled"} <= set(onward)
-    assert all(state.onward is None for state in control.states if state.means in ("fault", "quick_stop"))
+    ends = ("fault", "fault_reaction", "quick_stop")
+    assert all(state.onward is None for state in control.states if state.means in ends)
     enabled = next(state.onward for state in control.states if state.means == "enabled")
     assert enabled not in (control.off, control.quick_stop)
     assert control.torque_bits == 0 or not control.torque_bits & control.speed_bits
@@ -166,6 +167,14 @@ def test_wrong_profiles_are_told_with_file_and_line(tmp_path: Path, old: str, ne
     assert words in str(caught.value)
     assert all(problem.line and problem.file == str(path) for problem in caught.value.problems)
     assert all("\n" not in str(problem) for problem in caught.value.problems)
+
+
+def test_a_fault_reaction_is_not_a_fault(tmp_path: Path) -> None:
+    """CiA 402-2: in 000Fh the power stage is on. A profile from before says fault for both."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(text_of("generic/modbus").replace("means: fault_reaction", "means: fault"), encoding="utf-8")
+    with pytest.raises(DataFileError, match="000Fh is fault reaction active"):
+        load_modbus_profile(str(path))
 
 
 def test_an_echo_of_a_setpoint_that_is_not_there(tmp_path: Path) -> None:
