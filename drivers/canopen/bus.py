@@ -14,6 +14,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
+from drivers.canopen.bounded_send import bound_send
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
@@ -132,6 +133,7 @@ class CanLink:
 
         self._message = Message
         self._bus = bus
+        self._bounded = bound_send(bus)
         self._clock = clock
         self._tap = tap
         self.handlers: dict[int, Handler] = {}
@@ -177,10 +179,12 @@ class CanLink:
                 entry=MessageCode.BUS_FAILED,
             )
         try:
-            self._bus.send(message)
+            self._bus.send(message, **self._bounded)
         except Exception as error:  # python-can's backends raise CanError, OSError, BrokenPipeError alike
             if queue_is_full(error):
                 self._shut_up(f"the transmit queue is full ({error})")
+            elif self._bounded:            # a part of the frame may be in the adapter
+                self._shut_up(f"the adapter did not take a frame ({error})")
             raise CommunicationLost(
                 f"the bus did not accept a frame: {error}",
                 where=self.name,
