@@ -1,6 +1,6 @@
-"""Bounds the time for which python-can's `send` may block: an adapter that takes no frames must not stop the loop.
+"""Bounds the time for which python-can's ``send`` may block: an adapter that takes no frames must not stop the loop.
 
-python-can documents that `send` without a timeout may block without end (`can.BusABC.send`). Read in python-can 4.6:
+python-can documents that ``send`` without a timeout may block without end. Read in python-can 4.6:
 
 ```text
    interface                            without a timeout                          here
@@ -35,7 +35,7 @@ _SOCKET = "_SocketCanDaemonBus__socket"
 
 
 def bound_send(bus: can.BusABC) -> dict[str, float]:
-    """Bound the time of `bus.send`. Return the arguments that each call needs; empty if it is not bounded here."""
+    """Bound the time of ``bus.send``. Return the arguments that each call needs; empty if it is not bounded here."""
     connection = getattr(bus, _SOCKET, None)
     if connection is not None:
         connection.settimeout(SEND_S)      # a read waits for data first, so this bounds the send alone
