@@ -11,7 +11,7 @@ that follow, one step a cycle. So every cycle is seen, recorded and guarded alik
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -172,6 +172,7 @@ class Preflight:
     modes: frozenset[Mode]
     switch_while_enabled: bool
     quick_stop_in_torque_mode: bool    # quick stop from torque mode decelerates under speed control
+    displays_mode: bool = field(default=True, kw_only=True)    # the drive reports the mode that it is in
     rated_torque_nm: float
     torque_resolution_nm: float
     speed_resolution_rad_s: float

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     )
     from tdhil.runner.preconditions import (
         precondition_warnings as precondition_warnings, refuse_by_plan as refuse_by_plan,
+        stops_from_torque_mode as stops_from_torque_mode,
     )
     from tdhil.runner.settings import (
         ControlAssumptions as ControlAssumptions, ExcitationRequest as ExcitationRequest,
@@ -41,7 +42,7 @@ else:
         "interim": "FollowsInertia Identify Interim interim_answer live_inertia",
         "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless refuse_undersampled"
         " refuse_uninformative",
-        "preconditions": "precondition_warnings refuse_by_plan",
+        "preconditions": "precondition_warnings refuse_by_plan stops_from_torque_mode",
         "settings": "ControlAssumptions ExcitationRequest MachineLimits StopRequest",
         "speed_check": "speed_warnings",
         "stage_log": "stage_warnings",

@@ -332,10 +332,11 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
     if request.impedance is not None:
         _refuse_impedance(request, limits, preflight)
         return Mode.SPEED
-    wanted, can_torque = request.mode, Mode.TORQUE in preflight.modes and preflight.switch_while_enabled
-    if wanted == Mode.TORQUE.value and not can_torque:
+    wanted, obstacle = request.mode, _torque_obstacle(limits, preflight)
+    can_torque = not obstacle
+    if wanted == Mode.TORQUE.value and obstacle:
         raise PreflightRefused(
-            "torque mode is requested, but this drive can't enter a torque mode while the shaft turns",
+            f"torque mode is requested, but {obstacle}",
             where="6502h and profile",
             next_step="Use --mode speed",
             entry=MessageCode.NO_TORQUE_MODE,
@@ -351,7 +352,7 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
         )
     if kind.needs_torque_mode and mode is Mode.SPEED:
         raise PreflightRefused(
-            f"{request.kind} is requested, but {no_torque(wanted, preflight)}: {kind.why_torque_mode}",
+            f"{request.kind} is requested, but {no_torque(wanted, limits, preflight)}: {kind.why_torque_mode}",
             where="--excitation",
             next_step="Use --excitation pulses or multisine",
             entry=MessageCode.EXCITATION_NOT_POSSIBLE,
@@ -428,10 +429,31 @@ def _no_room(what: str, limit: str) -> PreflightRefused:
     )
 
 
-def no_torque(wanted: str | None, preflight: Preflight) -> str:
-    """Return why the run is not in torque mode."""
+def stops_from_torque_mode(limits: MachineLimits, quick_stop_brakes: bool, displays_mode: bool) -> bool:
+    """Return whether a run in torque mode can be stopped above its load.
+
+    ``quick_stop_brakes``: the profile promises that a quick stop brakes in torque mode. Without this promise, a stop
+    above a string needs speed mode, and must see that the drive has entered it. Otherwise the torque may be removed at
+    once, and the string unwinds and drives the shaft.
+    """
+    return not limits.has_drill_string or quick_stop_brakes or displays_mode
+
+
+def _torque_obstacle(limits: MachineLimits, preflight: Preflight) -> str:
+    """Return why the drive cannot use torque mode in this run; an empty text if it can."""
     if Mode.TORQUE not in preflight.modes:
         return "the drive has no torque mode"
     if not preflight.switch_while_enabled:
         return "the drive can't enter torque mode while it turns"
-    return "speed mode is requested" if wanted == Mode.SPEED.value else "speed mode was chosen"
+    if not stops_from_torque_mode(limits, preflight.quick_stop_in_torque_mode, preflight.displays_mode):
+        return (
+            "a stop above a drill string needs speed mode, and this drive does not report its mode: torque could be"
+            " removed at once, and the string would unwind"
+        )
+    return ""
+
+
+def no_torque(wanted: str | None, limits: MachineLimits, preflight: Preflight) -> str:
+    """Return why the run is not in torque mode."""
+    return _torque_obstacle(limits, preflight) or (
+        "speed mode is requested" if wanted == Mode.SPEED.value else "speed mode was chosen")

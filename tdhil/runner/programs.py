@@ -210,7 +210,7 @@ def switch_to_torque(run: Run, turning: Turning) -> TorqueResult | None:
 
 
 def _why_speed(run: Run) -> str:
-    return no_torque(run.task.request.mode, run.preflight)
+    return no_torque(run.task.request.mode, run.limits, run.preflight)
 
 
 def _ramps(turning: Turning, drifted: TorqueResult | None) -> tuple[Ramp, ...]:

@@ -58,7 +58,7 @@ def plan_dry(
     _refuse_undersampled(options, profile)
     guess, known, figures = _assumed(bench, limits)
     left_s = limits.time_s - BEFORE_ACQUIRE_S
-    mode, room = _mode(options, profile.can_torque), _room(options, limits)
+    mode, room = _mode(options, _can_torque(profile, limits)), _room(options, limits)
     try:
         planned = plan_acquisition(excitation_request(options), mode, room, guess, known, left_s)
     except PlanRefused as error:
@@ -131,7 +131,7 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, profile: Profile) -> N
 
     bench = simulated_default_rig(rig)
     limits = machine_limits(bench)
-    modes = (options.mode,) if options.mode else ("torque", "speed") if profile.can_torque else ("speed",)
+    modes = (options.mode,) if options.mode else ("torque", "speed") if _can_torque(profile, limits) else ("speed",)
     guess, known, _ = _assumed(bench, limits)
     room = _room(options, limits)
     _refuse_undersampled(options, profile)
@@ -175,11 +175,20 @@ def _hopeless(error: excitation.PlanRefused) -> PreflightRefused:
                             entry=MessageCode.PLAN_HOPELESS)
 
 
+def _can_torque(profile: Profile, limits: MachineLimits) -> bool:
+    """Return whether a run may use torque mode: the rule of `runner.choose_mode`, before the drive is known."""
+    from tdhil.runner import stops_from_torque_mode
+
+    return profile.can_torque and stops_from_torque_mode(
+        limits, profile.quick_stop.decelerates_in_torque_mode, profile.displays_mode)
+
+
 def _mode(options: RunOptions, can_torque: bool) -> str:
     wanted: str | None = options.mode
     if wanted == "torque" and not can_torque:
         raise PreflightRefused(
-            "torque mode is requested, but this drive can't enter a torque mode while the shaft turns",
+            "torque mode is requested, but this drive can't enter a torque mode while the shaft turns, or can't be"
+            " stopped from it above a string",
             where=f"profile {options.profile}",
             next_step="Use --mode speed",
             entry=MessageCode.NO_TORQUE_MODE,
