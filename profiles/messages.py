@@ -181,6 +181,10 @@ class MessageCode(Enum):
         60, "The load may stay behind the motor",
         "The excited frequencies do not show whether the load turns with the motor.",
         "Excite lower frequencies, below the oscillation of the load, or separate the load from the motor.")
+    BACKLASH_FOUND = (
+        61, "The coupling behind the motor has backlash",
+        "The load changes its flank when the torque on it reverses; the motor then turns by the play without the load.",
+        "Check the coupling and the gear, or raise --offset so that the torque on the load keeps its sign.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -8,6 +8,9 @@ r"""Two masses on a torsion spring: the paper's figure 7, friction at both ends.
 
     J kg·m², k N·m/rad, c and B N·m·s/rad, T dry friction and τ N·m
 
+With a play of p between its flanks, the spring is loose while |θ_r − θ_L| ≤ p/2, and its twist counts from the nearer
+flank. A flank pushes and does not pull.
+
 Source: the paper, section 2.3, which shows the model and then uses equations 4 to 6 instead.
 
 A step of h uses the mid-point rule for the spring alone: τ is computed with the twist at mid-step and the mean of the
@@ -47,6 +50,7 @@ class TwoMassParams(MotorEnd):
     inertia_kg_m2: Positive = 1500.0
     stiffness_nm_rad: Positive = 473.0
     damping_nm_s_rad: NonNegative = 23.2
+    play_rad: NonNegative = 0.0
     bottom: Bottom = Bottom()
 
     @property
@@ -106,8 +110,22 @@ def stepper(params: TwoMassParams) -> Callable[..., TwoMassState]:
 
 def spring_torque(params: TwoMassParams, state: TwoMassState) -> float:
     """Return the torque τ that the string takes from the motor, N·m."""
-    return (params.stiffness_nm_rad * (state.angle_rad - state.bottom_angle_rad)
-            + params.damping_nm_s_rad * (state.speed_rad_s - state.bottom_speed_rad_s))
+    twist = _beyond_play(params, state.angle_rad - state.bottom_angle_rad)
+    damped = params.damping_nm_s_rad * (state.speed_rad_s - state.bottom_speed_rad_s)
+    return _pushed(params, params.stiffness_nm_rad * twist, damped)
+
+
+def _beyond_play(params: TwoMassParams, twist_rad: float) -> float:
+    """Return the twist of the spring, counted from the nearer flank; 0 between the flanks."""
+    half = 0.5 * params.play_rad
+    return twist_rad - min(max(twist_rad, -half), half) if half else twist_rad
+
+
+def _pushed(params: TwoMassParams, spring_nm: float, damped_nm: float) -> float:
+    """Return the torque of spring and damper; with play only if it pushes."""
+    if not params.play_rad:
+        return spring_nm + damped_nm
+    return max(spring_nm + damped_nm, 0.0) if spring_nm > 0.0 else min(spring_nm + damped_nm, 0.0) if spring_nm else 0.0
 
 
 def _piece_of(params: TwoMassParams) -> Callable[[TwoMassState, float, float, float], TwoMassState]:
@@ -117,12 +135,12 @@ def _piece_of(params: TwoMassParams) -> Callable[[TwoMassState, float, float, fl
     def piece(state: TwoMassState, drive: float, below_nm: float, dt_s: float) -> TwoMassState:
         speed, angle, bristle, low_speed, low_angle, low_bristle = state
         difference = speed - low_speed
-        spring = stiffness * (angle - low_angle + 0.5 * dt_s * difference)
-        torque = spring + damping * difference
+        spring = stiffness * _beyond_play(params, angle - low_angle + 0.5 * dt_s * difference)
+        torque = _pushed(params, spring, damping * difference)
         end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
         low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
         if damping > 0.0:
-            torque = spring + 0.5 * damping * (difference + end - low_end)
+            torque = _pushed(params, spring, 0.5 * damping * (difference + end - low_end))
             end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
             low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
         return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)

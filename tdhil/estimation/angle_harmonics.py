@@ -34,7 +34,8 @@ import numpy as np
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.cubic_spline import CubicSpline
 from tdhil.estimation.frequency_domain import ModelCurve, filters
-from tdhil.estimation.result import AngleHarmonic, BudgetLine, Estimate, normal_quantile
+from tdhil.estimation.line_influence import inertia_changes, segment_means, widened
+from tdhil.estimation.result import AngleHarmonic, Estimate, normal_quantile
 from tdhil.estimation.samples import Samples, Stretch, usual_interval
 from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Recording
@@ -483,16 +484,6 @@ class _FittedShaft:
         free, covariance = curve.covariance()
         return cls(curve, theta, tuple(free), covariance, *lines.delay(theta[curve.fitted.problem.model.mechanical :]))
 
-    def inertia_by_torque(self, lines: ComplexArray) -> float:
-        """Return the change of J per unit of a torque that is subtracted, with its lines in every segment mean."""
-        problem = self.curve.fitted.problem
-        g, slopes = problem.model.impedance_jacobian(self.theta, problem.s)
-        by = slopes[problem.owner][:, list(self.free)] * problem.speed[:, None]
-        weight = 2.0 * problem.root_periods**2 / problem.variance(g)[problem.owner]
-        score = (by.conj() * (weight * lines)[:, None]).real.sum(axis=0)
-        row = problem.model.inertia_row[list(self.free)]
-        return -float(row @ self.covariance @ score)
-
 
 def _fitted(lines: _AngleLines, segments: tuple[_GridSegment, ...], model: _FittedShaft) -> HarmonicTorque | None:
     """Return the harmonics beside a model, with the model's part in their covariance; None without any."""
@@ -540,46 +531,32 @@ def _through_filter(
 def _lines_of_parts(case: PeriodicCase, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
                     ) -> list[ComplexArray]:
     """Return the reported lines of each part of the torque, 1 N·m, in every segment mean of the model's lines."""
-    problem = model.curve.fitted.problem
-    mechanical = problem.model.mechanical
-    by_line: dict[float, list[ComplexArray]] = {}
-    for number, (stretch, fit) in enumerate(zip(case.stretches, case.fits, strict=True)):
-        if not len(fit.speed):
-            continue
-        omega: FloatArray = np.asarray(2.0 * np.pi * np.array(fit.lines_hz), dtype=np.float64)
+    mechanical = model.curve.fitted.problem.model.mechanical
+    by_segment = {}
+    for number, segment in segments.items():
+        omega: FloatArray = np.asarray(2.0 * np.pi * np.array(case.fits[number].lines_hz), dtype=np.float64)
         s: ComplexArray = np.asarray(1j * omega, dtype=np.complex128)
-        own = np.zeros((2 * len(torque.orders), len(omega)), dtype=np.complex128)
-        segment = segments.get(number)
-        if segment is not None:
-            count = len(segment.angle_rad) // segment.periods
-            time: FloatArray = np.asarray(stretch.segment.period_s / count * np.arange(count), dtype=np.float64)
-            for k, order in enumerate(torque.orders):
-                for j, wave in enumerate((np.cos(order * segment.angle_rad), np.sin(order * segment.angle_rad))):
-                    own[2 * k + j] = _lines(time, wave.reshape(segment.periods, -1).mean(axis=0), 0.0, omega)
-            own *= filters(model.theta[mechanical:], s)[1] * np.exp(-s * model.delay_s)
-        for column, hertz in enumerate(fit.lines_hz):
-            by_line.setdefault(round(hertz, 9), []).append(own[:, column])
-    rows = [np.array(by_line[round(line.hertz, 9)]) for line in problem.lines]
-    return list(np.concatenate(rows).T) if all(
-        len(row) == len(line.speed) for row, line in zip(rows, problem.lines, strict=True)) else []
+        count = len(segment.angle_rad) // segment.periods
+        period_s = case.stretches[number].segment.period_s
+        time: FloatArray = np.asarray(period_s / count * np.arange(count), dtype=np.float64)
+        waves = [wave(order * segment.angle_rad) for order in torque.orders for wave in (np.cos, np.sin)]
+        own = np.array([_lines(time, wave.reshape(segment.periods, -1).mean(axis=0), 0.0, omega) for wave in waves])
+        by_segment[number] = own * filters(model.theta[mechanical:], s)[1] * np.exp(-s * model.delay_s)
+    return segment_means(case, model.curve, by_segment)
 
 
 def _widened(
     case: PeriodicCase, finding: Finding, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
 ) -> Finding:
     """Return the finding with the part of the harmonics in the uncertainty of J."""
-    inertia = finding.inertia
-    if inertia is None:
+    if finding.inertia is None:
         return finding
-    rows = np.array([model.inertia_by_torque(lines) for lines in _lines_of_parts(case, segments, torque, model)])
+    rows = np.array([float(np.sum(inertia_changes(model.curve, model.theta, lines)))
+                     for lines in _lines_of_parts(case, segments, torque, model)])
     if not len(rows):
         return finding
     half = normal_quantile(case.options.confidence) * math.sqrt(max(float(rows @ torque.covariance @ rows), 0.0))
-    low, high = (math.hypot(side, half) for side in (inertia.value - inertia.low, inertia.high - inertia.value))
-    budget = finding.budget
-    if budget:
-        budget = (*budget[:-1], BudgetLine("harmonics of the angle", half, "their amplitudes and phases"), budget[-1])
-    return replace(finding, budget=budget, inertia=Estimate(inertia.value, inertia.value - low, inertia.value + high))
+    return widened(finding, half, "harmonics of the angle", "their amplitudes and phases")
 
 
 Again = Callable[[Samples], tuple[PeriodicCase, Finding]]

@@ -132,7 +132,7 @@ class Finding(ModelResult):
         return Finding(
             model=self.model, words=self.words, residual=self.residual, lines=self.lines,
             samples_used=self.samples_used, warnings=self.warnings, contradiction=contradiction,
-            harmonics=self.harmonics,
+            bent=self.bent, harmonics=self.harmonics, backlash=self.backlash,
         )
 
     @property

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 
 from tdhil.estimation.angle_harmonics import without_harmonics
+from tdhil.estimation.backlash import with_backlash
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.conclude import conclude
 from tdhil.estimation.cross_checks import (
@@ -48,6 +49,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             case = periodic = clear_lines(periodic)
             finding = identify_lines(periodic)
             case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation))
+            finding = with_backlash(case, finding)
     except Refused as refused:
         finding = Finding(refusal=refused.refusal)
     seen = finding

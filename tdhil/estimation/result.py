@@ -213,6 +213,18 @@ class AngleHarmonic:
 
 
 @dataclass(frozen=True)
+class Backlash:
+    """Play of a coupling or a gear behind the motor, from flank to flank, at the motor shaft, rad.
+
+    ``at_motor_rad``: the part that the motor moves against a rigid shaft while the load changes its flank, J_L/J of the
+    play. Both are None if the angle shows a play, and the model of the flanks does not explain it well enough.
+    """
+
+    play_rad: Estimate | None
+    at_motor_rad: Estimate | None
+
+
+@dataclass(frozen=True)
 class ShaftCovariance:
     """Covariance of the values of a compliant shaft, by the quadratic approximation of the likelihood.
 
@@ -513,6 +525,7 @@ class ModelResult:
     friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
     compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
     harmonics: tuple[AngleHarmonic, ...] | None = None  # of the shaft's angle, the largest first; None: not known
+    backlash: tuple[Backlash, ...] | None = None        # of the coupling; empty: none found; None: not known
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
 
     def quantities(self) -> dict[str, Any]:

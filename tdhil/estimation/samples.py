@@ -289,6 +289,17 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
     return tuple(found)
 
 
+def thinned(period: Samples, blocks: int) -> Samples:
+    """Return means over blocks of equally many samples; the samples themselves if there are few."""
+    size = len(period) // blocks
+    if size < 2:
+        return period
+    starts = np.arange(0, len(period), size)
+    counts = np.diff(np.append(starts, len(period)))
+    return Samples(*(np.add.reduceat(signal, starts) / counts
+                     for signal in (period.time_s, period.speed_rad_s, period.torque_nm)))
+
+
 def usual_interval(time_s: FloatArray) -> float:
     """Return the median time between samples (N,), s."""
     return float(np.median(np.diff(time_s), overwrite_input=True)) if len(time_s) > 1 else math.inf

@@ -25,7 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.estimation.samples import Samples, Stretch
+from tdhil.estimation.samples import Samples, Stretch, thinned
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def unexcited_lines(stretch: Stretch, fit: PeriodLines, harmonics: tuple[int, ..
     excited = len(segment.lines_hz)
     every = (*segment.lines_hz, *lines)
     blocks = _BLOCKS_A_CYCLE * max(1, round(segment.period_s * max(every)))
-    fits = [_fit(_thinned(period, blocks), segment.start_s, every) for period in stretch.periods]
+    fits = [_fit(thinned(period, blocks), segment.start_s, every) for period in stretch.periods]
     table: ComplexArray = np.array([fit[1] for fit in fits]).reshape(-1, 3, len(every))[:, :, excited:]
     return PeriodLines(
         lines_hz=lines,
@@ -269,17 +269,6 @@ def unexcited_lines(stretch: Stretch, fit: PeriodLines, harmonics: tuple[int, ..
         drift=fit.drift,
         rounding=fit.rounding,
     )
-
-
-def _thinned(period: Samples, blocks: int) -> Samples:
-    """Return means over blocks of equally many samples; the samples themselves if there are few."""
-    size = len(period) // blocks
-    if size < 2:
-        return period
-    starts = np.arange(0, len(period), size)
-    counts = np.diff(np.append(starts, len(period)))
-    return Samples(*(np.add.reduceat(signal, starts) / counts
-                     for signal in (period.time_s, period.speed_rad_s, period.torque_nm)))
 
 
 def _least(lines: ComplexArray) -> float:

@@ -20,6 +20,7 @@ from tdhil.report.card import (
     COMPLIANT,
     estimate_text,
     in_degrees,
+    in_milliradians,
     inertia_text,
     minutes,
     plus_minus,
@@ -31,6 +32,7 @@ from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
+    BACKLASH,
     ESTIMATES,
     MOMENTUM_CROSS_CHECK,
     TORQUE_OVER_ANGLE,
@@ -349,6 +351,9 @@ def _numbers(document: Part) -> Iterator[Block]:
         scaled = part is not None and "low_total" in part
         add(f"{label.name}, torque scale included" if scaled else label.name, part, label.unit,
             "_total" if scaled else "")
+    for one in document.get("backlash") or ():
+        if (play := one[BACKLASH.key]) is not None:
+            add(BACKLASH.name, in_milliradians(play), BACKLASH.unit)
     if shaft is not None:
         for title, key, unit in COMPLIANT:
             add(title, shaft[key], unit)

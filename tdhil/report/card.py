@@ -18,6 +18,7 @@ from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
+    BACKLASH,
     ESTIMATES,
     MOMENTUM_CROSS_CHECK,
     TORQUE_OVER_ANGLE,
@@ -182,6 +183,20 @@ def harmonic_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         title = ""
 
 
+def backlash_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield the play of a coupling with backlash; an older document has none."""
+    for one in document.get("backlash") or ():
+        if (play := one[BACKLASH.key]) is None:
+            yield BACKLASH.on_card, "found, size not known"
+        else:
+            yield BACKLASH.on_card, f"{estimate_text(in_milliradians(play), BACKLASH.unit)}, at the motor shaft"
+
+
+def in_milliradians(part: Mapping[str, Any]) -> dict[str, float]:
+    """Return an angle with its interval, converted from rad to mrad."""
+    return {key: 1e3 * part[key] for key in ("value", "low", "high")}
+
+
 def in_degrees(part: Mapping[str, Any]) -> dict[str, float]:
     """Return an angle with its interval, converted from rad to degrees."""
     return {key: math.degrees(part[key]) for key in ("value", "low", "high")}
@@ -277,7 +292,7 @@ def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
         if (part := document[label.key]) is not None:
             rows.add_row(label.on_card, estimate_text(quoted(part), label.unit))
     more = (*impedance_rows(document), *compliant_rows(document), *harmonic_rows(document),
-            *friction_rows(document, 1 if narrow else 2), *opinion_rows(document))
+            *backlash_rows(document), *friction_rows(document, 1 if narrow else 2), *opinion_rows(document))
     for title, text in more:
         rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:

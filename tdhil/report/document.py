@@ -136,6 +136,7 @@ def result_document(
         "second_opinions": [asdict(opinion) for opinion in found.second_opinions],
         "friction_curve": [asdict(point) for point in found.friction_curve],
         "harmonics": None if found.harmonics is None else [asdict(one) for one in found.harmonics],
+        "backlash": None if found.backlash is None else [asdict(one) for one in found.backlash],
         "compliant": _compliant(found),
         "impedance": None if found.impedance is None else asdict(found.impedance) | {
             "verdict": found.impedance.verdict.value

@@ -26,6 +26,7 @@ ESTIMATES: Final = (
     Label("torque_lag_s", "lag of the reported torque", "lag, reported torque", "s"),
     Label("skew_s", "time offset between speed and torque", "time offset", "s"),
 )
+BACKLASH: Final = Label("play_rad", "backlash, from flank to flank at the motor shaft", "backlash", "mrad")
 TORQUE_OVER_ANGLE: Final = "torque over angle"
 UNCERTAINTY_BUDGET: Final = "uncertainty budget"
 MOMENTUM_CROSS_CHECK: Final = "momentum cross-check"

@@ -6,7 +6,7 @@ import numpy as np
 
 from tdhil.recording import Recording
 from tests.estimation.shaft_bench import Rig, recordings
-from tests.estimation.stages_bench import Stages, turn
+from tests.estimation.stages_bench import Play, Stages, turn
 
 RATED_NM = 400.0
 """Rated torque of the bench's rig: its torque limit."""
@@ -22,11 +22,14 @@ class OverAngle:
     periods: int = 6
     rate_hz: float = 250.0
     every: int = EVERY
+    play: Play | None = None
+    static: float = 0.0    # N·m; Stribeck friction at standstill, above Coulomb's
 
 
 def run_over_angle(bench: OverAngle, seeds: list[int]) -> list[Recording]:
     """One recording per seed, with the angle as counted once in ``every`` samples."""
-    motion, shaft, reported = turn(Stages(rig=bench.rig, periods=bench.periods), seeds)
+    stages = Stages(rig=bench.rig, periods=bench.periods, static=bench.static, play=bench.play)
+    motion, shaft, reported = turn(stages, seeds)
     found = recordings(bench.rig, motion, replace(shaft, torque=reported), seeds, rate_hz=bench.rate_hz)
     return [replace(one, position_rad=_counted(one, shaft.angle[:, k], bench.every)) for k, one in enumerate(found)]
 

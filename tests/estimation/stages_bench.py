@@ -29,6 +29,47 @@ class Stages:
     stribeck_speed: float = 3.0
     coast: bool = False               # torque off at the end, from the second mean speed
     coast_torque: float = 0.0         # what the drive truly gives while it reports none
+    play: "Play | None" = None        # a load behind a coupling with play; None: one rigid shaft
+
+
+@dataclass(frozen=True)
+class Play:
+    """A load behind a coupling with play. Its inertia and its friction are parts of the rig's."""
+
+    angle: float                      # from flank to flank, rad; 0: a linear spring
+    inertia: float                    # of the load, kg·m²
+    coulomb: float = 0.0              # of the load, N·m
+    viscous: float = 0.0              # of the load, N·m·s/rad
+    natural: float = 80.0             # of the closed coupling, rad/s
+    ratio: float = 0.3                # damping ratio of the closed coupling
+
+
+class _Coupling:
+    """Load and coupling, stepped beside the motor: a spring and a damper that can push, and not pull."""
+
+    def __init__(self, play: Play, rig: Rig, speed: np.ndarray) -> None:
+        self.play, self.motor_inertia = play, rig.inertia - play.inertia
+        reduced = self.motor_inertia * play.inertia / rig.inertia
+        self.stiffness = reduced * play.natural**2
+        self.damping = 2.0 * play.ratio * reduced * play.natural
+        self.speed = speed.copy()
+        held = play.coulomb + play.viscous * speed
+        self.twist = 0.5 * play.angle + held / self.stiffness
+
+    def torque(self, motor_speed: np.ndarray) -> np.ndarray:
+        """Torque on the load; the load and the twist are moved on by one step."""
+        half = 0.5 * self.play.angle
+        closed = np.where(np.abs(self.twist) > half, self.twist - half * np.sign(self.twist), 0.0)
+        found = self.stiffness * closed + self.damping * (motor_speed - self.speed)
+        if half > 0.0:
+            found = np.where(closed > 0.0, np.maximum(found, 0.0), np.where(closed < 0.0, np.minimum(found, 0.0), 0.0))
+        drag = self.play.viscous * self.speed + self.play.coulomb * np.sign(self.speed)
+        self.speed = self.speed + DT / self.play.inertia * (found - drag)
+        return found
+
+    def turn(self, motor_speed: np.ndarray) -> None:
+        """Move the twist by one step, after both speeds."""
+        self.twist = self.twist + DT * (motor_speed - self.speed)
 
 
 def run_stages(stages: Stages, seeds: list[int], **report) -> list:
@@ -74,6 +115,7 @@ def turn(stages: Stages, seeds: list[int]) -> tuple[Motion, Shaft, np.ndarray]:
     host_kp, host_ki = slow * rig.inertia, slow**2 * rig.inertia / 4.0
     speed, torque, reported, turned = (np.empty((len(time), many)) for _ in range(4))
     angle = np.zeros(many)
+    coupling = None if stages.play is None else _Coupling(stages.play, rig, omega)
     host_keep, drop = np.exp(-DT / 0.4), None
     for n in range(len(time)):
         phase = mode[n]
@@ -101,7 +143,13 @@ def turn(stages: Stages, seeds: list[int]) -> tuple[Motion, Shaft, np.ndarray]:
         for order, amplitude, shift in rig.harmonics:
             friction = friction + amplitude * np.cos(order * (angle + 0.5 * DT * omega) + shift)
         before = omega
-        omega = np.maximum(omega + DT / rig.inertia * (actual - load[n] - friction), 0.0)
+        if coupling is None:
+            omega = np.maximum(omega + DT / rig.inertia * (actual - load[n] - friction), 0.0)
+        else:
+            own = friction - coupling.play.viscous * omega - coupling.play.coulomb * np.sign(omega)
+            given = coupling.torque(omega)
+            omega = np.maximum(omega + DT / coupling.motor_inertia * (actual - load[n] - own - given), 0.0)
+            coupling.turn(omega)
         angle = angle + 0.5 * DT * (before + omega)
 
     segments = tuple(

@@ -16,7 +16,7 @@ CEILINGS = {
     "tdhil/calibration": (1_500, FIRST),
     "tdhil/cli": (6_600, FIRST),
     "tdhil/config": (1_800, FIRST),
-    "tdhil/estimation": (14_400, FIRST),
+    "tdhil/estimation": (15_000, "0079"),
     "tdhil/evidence": (1_400, FIRST),
     "tdhil/fleet": (2_100, FIRST),
     "tdhil/recording": (5_400, FIRST),

@@ -180,3 +180,35 @@ def test_ends_too_stiffly_joined_are_refused_with_the_cure() -> None:
         TwoMassParams(stiffness_nm_rad=1e12)
     with pytest.raises(ValueError, match=r"damping_nm_s_rad: it would damp"):
         TwoMassParams(damping_nm_s_rad=1e7)
+
+
+LOOSE = TwoMassParams(inertia_kg_m2=60.0, stiffness_nm_rad=1e5, damping_nm_s_rad=300.0, viscous_nm_s_rad=6.0,
+                      coulomb_nm=40.0, play_rad=0.01,
+                      bottom=Bottom(inertia_kg_m2=44.0, coulomb_nm=20.0, static_nm=20.0, viscous_nm_s_rad=2.0))
+
+
+def test_play_against_an_integrator() -> None:
+    """The motor is driven so that the load changes its flank in each period; speeds stay positive."""
+    def torque(time: float) -> float:
+        return 100.0 + 200.0 * math.sin(2.0 * math.pi * 0.3 * time)
+
+    def slopes(time: float, y: list[float]) -> list[float]:
+        speed, angle, low_speed, low_angle = y
+        twist = angle - low_angle - min(max(angle - low_angle, -0.005), 0.005)
+        push = 1e5 * twist + 300.0 * (speed - low_speed)
+        push = max(push, 0.0) if twist > 0.0 else min(push, 0.0) if twist < 0.0 else 0.0
+        return [(torque(time) - 40.0 - 6.0 * speed - push) / 60.0, speed,
+                (push - 20.0 - 2.0 * low_speed) / 44.0, low_speed]
+
+    state, twists = TwoMassState(speed_rad_s=5.0, angle_rad=0.005, bottom_speed_rad_s=5.0), []
+    for n in range(3000):
+        state = step(LOOSE, state, torque((n + 0.5) * DT), DT)
+        twists.append(state.angle_rad - state.bottom_angle_rad)
+    exact = solve_ivp(slopes, (0.0, 3000 * DT), [5.0, 0.005, 5.0, 0.0], rtol=1e-8, atol=1e-9, max_step=DT).y[:, -1]
+    assert (state.speed_rad_s, state.angle_rad) == pytest.approx(exact[:2], rel=1e-4)
+    assert (state.bottom_speed_rad_s, state.bottom_angle_rad) == pytest.approx(exact[2:], rel=1e-4)
+    assert min(twists) < -0.005 and max(twists) > 0.005
+    assert spring_torque(LOOSE, TwoMassState(angle_rad=0.004)) == 0.0
+    assert spring_torque(LOOSE, TwoMassState(angle_rad=0.006)) == pytest.approx(100.0)
+    # a flank pushes: a motor that backs away from it feels nothing
+    assert spring_torque(LOOSE, TwoMassState(speed_rad_s=-5.0, angle_rad=0.006)) == 0.0

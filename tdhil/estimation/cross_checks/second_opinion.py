@@ -66,8 +66,7 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     contradiction = _contradiction(against, finding, case.options.confidence)
     if contradiction.reason:
         # a withdrawn J gets no further figures, as for residuals that contradict the model
-        finding = Finding(model=finding.model, words=finding.words, residual=finding.residual, lines=finding.lines,
-                          bent=finding.bent, samples_used=finding.samples_used, contradiction=contradiction)
+        finding = finding.taken_back(contradiction)
     if inertia is None or case.levels is None:
         return replace(finding, second_opinions=opinions, warnings=warnings)
     curve = friction_curve(case.recording, case.samples, case.levels, inertia, case.options)

@@ -1,0 +1,76 @@
+"""Backlash of the coupling: found in the angle, measured, and in the interval of J."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from profiles import MessageCode
+from tdhil.estimation import Verdict, identify
+from tests.estimation.angle_bench import COUNTS, OverAngle, run_over_angle
+from tests.estimation.stages_bench import Play
+
+TRUE, COUNT = 104.0, 2.0 * math.pi / COUNTS
+
+
+@cache
+def recorded(counts: float, inertia: float = 40.0, coulomb: float = 20.0) -> tuple:
+    """Two seeds of a run whose coupling has so many counts of play."""
+    play = Play(counts * COUNT, inertia, coulomb, viscous=2.0)
+    return tuple(run_over_angle(OverAngle(play=play), [0, 1]))
+
+
+@pytest.mark.parametrize(("counts", "inertia"), [(3.0, 40.0), pytest.param(10.0, 60.0, marks=pytest.mark.heavy)])
+def test_backlash_is_found_with_its_angle(counts, inertia):
+    for recording in recorded(counts, inertia):
+        found = identify(recording)
+        (one,) = found.backlash
+        assert one.play_rad.low <= counts * COUNT <= one.play_rad.high
+        # the motor shows J_L/J of the play
+        assert one.at_motor_rad.low <= counts * COUNT * inertia / TRUE <= one.at_motor_rad.high
+        assert one.play_rad.high < 1.8 * one.play_rad.low
+        assert found.inertia.low <= TRUE <= found.inertia.high
+        assert any(getattr(one, "entry", None) is MessageCode.BACKLASH_FOUND for one in found.warnings)
+
+
+@pytest.mark.heavy
+def test_backlash_widens_the_interval_and_stands_in_the_budget():
+    recording = recorded(3.0)[0]
+    found, before = identify(recording), identify(replace(recording, position_rad=None))
+    assert before.backlash is None
+    assert found.inertia.value == pytest.approx(before.inertia.value, rel=1e-9)
+    assert found.inertia.low < before.inertia.low and found.inertia.high > before.inertia.high
+    (line,) = (one for one in found.budget if one.source == "backlash")
+    assert 0.0 < line.half_width_kg_m2 < 0.01 * TRUE
+
+
+def test_an_elastic_coupling_without_play_has_none():
+    for recording in recorded(0.0):
+        assert identify(recording).backlash == ()
+
+
+def test_a_play_that_the_load_never_crosses_is_not_found():
+    """The load's friction is above the largest torque that the motion takes from its inertia."""
+    for recording in recorded(10.0, 20.0, 50.0):
+        found = identify(recording)
+        assert found.backlash == ()
+        assert found.inertia.low <= TRUE <= found.inertia.high
+
+
+@pytest.mark.heavy
+def test_a_play_too_large_for_a_linear_shaft_is_the_reason():
+    for recording in recorded(120.0, 70.0, 10.0):
+        found = identify(recording)
+        assert found.backlash
+        assert found.inertia is None or found.inertia.low <= TRUE <= found.inertia.high
+        if found.verdict is Verdict.MODEL_REJECTED:
+            assert "backlash" in f"{found.reason} {found.advice}"
+
+
+def test_too_few_angles_say_nothing():
+    recording = recorded(3.0)[0]
+    position = recording.position_rad.copy()
+    position[np.arange(len(position)) % 500 != 0] = np.nan      # once in 2 s
+    assert identify(replace(recording, position_rad=position)).backlash is None
