@@ -74,6 +74,14 @@ def inertia_to_tune_for(
     return low, value, high
 
 
+def inertia_warnings(result: Mapping[str, Any]) -> list[str]:
+    """Return a warning if the result does not show whether its J includes a string below the motor."""
+    if MessageCode.LOAD_MAY_STAY_BEHIND.code not in (result.get("warning_codes") or ()):
+        return []
+    return ["the result does not show whether J is that of the motor alone or of motor and string together. The gains"
+            " need J of the motor alone: identify with excited frequencies on both sides of the string's resonance"]
+
+
 def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the section `impedance` of a result for the same shaft. Raises UsageError and TuningRefused."""
     from tdhil.soft_torque import TuningRefused

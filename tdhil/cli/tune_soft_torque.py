@@ -22,6 +22,7 @@ from tdhil.cli.tune_inputs import (
     ends_of,
     estimated,
     inertia_to_tune_for,
+    inertia_warnings,
     is_number,
     measured_lags,
     positive_number,
@@ -554,7 +555,7 @@ def _tuned_for(
     from tdhil.soft_torque import drive_settings
 
     settings: dict[str, tuple[DriveSetting, ...]] = {}
-    warnings = []
+    warnings = inertia_warnings(result)
     ratio = float(result["gear_ratio"])
     if profile is not None and namespace.loop == "drive":
         parameters = profile.speed_controller

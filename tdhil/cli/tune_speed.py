@@ -19,6 +19,7 @@ from tdhil.cli.tune_inputs import (
     check_present,
     ends_of,
     inertia_to_tune_for,
+    inertia_warnings,
     is_number,
     positive_number,
     profile_for,
@@ -258,7 +259,7 @@ def _tuned_for(
     from tdhil.soft_torque import SpeedController, drive_settings
 
     settings = {}
-    warnings = []
+    warnings = inertia_warnings(result)
     if profile is not None and profile.speed_controller is not None:
         for row in design.rows:
             law = SpeedController(row.gains.gain_nm_s_rad, row.gains.integral_nm_rad)

@@ -120,6 +120,13 @@ def test_what_is_refused(tuned, words, said, code, message):
     assert "Traceback" not in err
 
 
+def test_a_j_that_may_include_the_string_is_warned_of(tuned):
+    _, document, _ = tuned(warning_codes=[MessageCode.LOAD_MAY_STAY_BEHIND.code])
+    assert any("motor alone or of motor and string" in one for one in document["warnings"])
+    _, document, _ = tuned()
+    assert not any("string" in one for one in document["warnings"])
+
+
 def test_thin_present_gains_are_named_with_a_code(tuned):
     _, document, _ = tuned("--present", 400, 9000)
     assert document["controllers"][0]["failed"]
