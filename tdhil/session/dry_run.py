@@ -176,7 +176,7 @@ def _hopeless(error: excitation.PlanRefused) -> PreflightRefused:
 
 
 def _can_torque(profile: Profile, limits: MachineLimits) -> bool:
-    """Return whether a run may use torque mode: the rule of `runner.choose_mode`, before the drive is known."""
+    """Return whether a run may use torque mode: the rule of `choose_mode`, before the drive is known."""
     from tdhil.runner import stops_from_torque_mode
 
     return profile.can_torque and stops_from_torque_mode(
