@@ -30,7 +30,8 @@ if TYPE_CHECKING:
         NO_WATCHDOG_FLAG as NO_WATCHDOG_FLAG, SHARED_FLAG as SHARED_FLAG, PreflightTable as PreflightTable,
     )
     from drivers.quick_stop import (
-        BareStopReport as BareStopReport, Ended as Ended, Target as Target, bare_stop as bare_stop,
+        LONGEST_STOP_S as LONGEST_STOP_S, BareStopReport as BareStopReport, Ended as Ended, Target as Target,
+        bare_stop as bare_stop,
     )
     from drivers.standstill import (
         STANDSTILL_ANGLE_RAD_S as STANDSTILL_ANGLE_RAD_S, STANDSTILL_RAD_S as STANDSTILL_RAD_S,
@@ -45,6 +46,6 @@ else:
         "errors": "CommandRejected CommunicationLost DataFileError DriveFault LimitHit ModeNotConfirmed ObjectRefused "
                   "PreflightRefused Problem ReportsContradict SensorFault StopNotConfirmed TdhilError",
         "preflight": "ACCEPTED_BY ANY_CLIENT NOTHING_STOPS_IT NO_WATCHDOG_FLAG SHARED_FLAG PreflightTable",
-        "quick_stop": "BareStopReport Ended Target bare_stop",
+        "quick_stop": "LONGEST_STOP_S BareStopReport Ended Target bare_stop",
         "standstill": "STANDSTILL_ANGLE_RAD_S STANDSTILL_RAD_S",
     })

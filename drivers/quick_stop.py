@@ -43,7 +43,7 @@ SILENT_S = 3.0
 """Longest time without any reply, s."""
 NO_SLOWER_S, SLOWER = 10.0, 0.99
 """Longest time, s, in which the speed does not fall below this share of its least value."""
-LONGEST_S = 120.0
+LONGEST_STOP_S = 120.0
 """Longest time of the whole stop, s."""
 MOST_TROUBLES = 20
 """Number of errors that the report repeats."""
@@ -146,7 +146,7 @@ class StopCourse:
     ended: Ended | None = None
 
     @classmethod
-    def begin(cls, now_s: float, longest_s: float = LONGEST_S) -> StopCourse:
+    def begin(cls, now_s: float, longest_s: float = LONGEST_STOP_S) -> StopCourse:
         """Return the state before the first request."""
         return cls(StopState.ASKING, now_s, now_s, now_s, math.inf, math.inf, longest_s)
 
@@ -211,7 +211,7 @@ def step(before: StopCourse, now: StopRound) -> tuple[StopCourse, StopAction]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> BareStopReport:
+def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_STOP_S) -> BareStopReport:
     """Stop the shaft. Never raises: errors are among the remarks."""
     stopping, action = StopCourse.begin(clock.now_s(), longest_s), StopAction.REQUEST
     readings: list[Seen] = []

@@ -16,6 +16,7 @@ from urllib.parse import quote, urlencode
 from drivers import CommunicationLost
 from profiles import message_of
 from tdhil.errors import MessageCode, TdhilError, UsageError
+from tdhil.service.limits import REPLY_S
 
 _API: Final = "/api/v1"
 _ARCHIVED: Final[dict[bool, dict[str, Any]]] = {False: {}, True: {"archived": "true"}}
@@ -57,7 +58,7 @@ class Client:
 
     def __init__(
         self, url: str = "http://127.0.0.1:8420", *, token: str | None = None, ca: str | Path | None = None,
-        timeout_s: float = 120.0,
+        timeout_s: float = REPLY_S,
     ) -> None:
         self._url = url.rstrip("/")
         self._timeout_s = timeout_s

@@ -20,6 +20,7 @@ from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.api_page import api_page
 from tdhil.service.languages import Language, language_of, languages
+from tdhil.service.limits import STOP_S
 from tdhil.service.middleware import off
 from tdhil.version import __version__
 
@@ -60,7 +61,7 @@ class Pages:
             lstrip_blocks=True,
         )
         found.globals.update(
-            version=__version__, form_options=form_options, stated_options=[OPTION[name] for name in STATED],
+            version=__version__, stop_s=STOP_S, form_options=form_options, stated_options=[OPTION[name] for name in STATED],
             language=language, languages=self._languages.values(),
             graphs=GRAPHS, _=language.text, word=language.word, hint=lambda option: _hint(language, option),
             code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
@@ -110,7 +111,7 @@ class Pages:
             known: dict[str, Any] = {}
             if "rig" in request.path_params:
                 known["rig"] = await off(
-                    lambda: site.rig_view(site.supervisor.rigs.get(request.path_params["rig"])))
+                    lambda: site.rig_view(site.supervisor.rig(request.path_params["rig"])))
             if "run" in request.path_params:
                 known["run"] = await off(lambda: site.run_view(request.path_params["run"]))
             if "fleet" in request.path_params:

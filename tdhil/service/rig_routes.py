@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.errors import MessageCode, UsageError
@@ -56,12 +57,12 @@ def routes(site: Site) -> list[Route]:
 
 async def rigs(site: Site, request: Request, body: None) -> list[RigView]:
     """Return every rig."""
-    return await off(lambda: [site.rig_view(one) for one in site.supervisor.rigs.all()])
+    return await off(lambda: [site.rig_view(one) for one in site.supervisor.all_rigs()])
 
 
 async def rig(site: Site, request: Request, body: None) -> RigView:
     """Return one rig."""
-    return await off(lambda: site.rig_view(site.supervisor.rigs.get(request.path_params["rig"])))
+    return await off(lambda: site.rig_view(site.supervisor.rig(request.path_params["rig"])))
 
 
 async def rig_file(site: Site, request: Request, body: None) -> RigFileView:
@@ -82,8 +83,9 @@ def _file_view(found: RigFile) -> RigFileView:
     """Return the view of a rig's file. Raises UsageError."""
     try:
         data = found.path.read_bytes()
-        return RigFileView(found.id, data.decode(), hashlib.sha256(data).hexdigest(), sorted(EDITABLE))
-    except (OSError, ValueError) as error:
+        return RigFileView(found.id, data.decode("utf-8", "replace"), hashlib.sha256(data).hexdigest(),
+                           sorted(EDITABLE))
+    except OSError as error:
         raise UsageError(f"can't be read as text ({error})", where=found.path.name) from error
 
 
@@ -154,19 +156,26 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
     who = asking.name
     site.metrics.stops_asked.inc()
 
-    def stop() -> StoppedView:
-        found = site.supervisor.rigs.get(which)
+    def look() -> tuple[str | None, RigFile | None]:
         if (run := site.supervisor.run_of(which)) is not None:
-            site.supervisor.stop(run, who)
-            return StoppedView(which, [run])
+            return run, None
+        found = site.supervisor.rig(which)
         if "operator" not in asking.roles and site.supervisor.certainly_idle(found):
             raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that another"
                              " program may control", where=f"rig {which}",
                              next_step="Ask an operator. If the shaft turns, use the hard-wired stop")
-        code, said = site.supervisor.stop_drive(found, who)
-        return StoppedView(which, [], code, said)
+        return None, found
 
-    return await site.at_once(stop)
+    def noted() -> None:
+        site.supervisor.note(who, "stop asked", run, which, joined=True)
+
+    run, found = await site.at_once(look)          # for each request: a run may have begun since another stop
+    if run is not None:
+        await site.shared_stop(f"run {run}", partial(site.supervisor.stop, run, who), noted)
+        return StoppedView(which, [run])
+    assert found is not None
+    code, said = await site.shared_stop(f"rig {which}", partial(site.supervisor.stop_drive, found, who), noted)
+    return StoppedView(which, [], code, said)
 
 
 async def faults(site: Site, request: Request, body: None) -> list[FaultView]:

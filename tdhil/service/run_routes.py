@@ -157,7 +157,10 @@ async def stop(site: Site, request: Request, body: Any) -> RunView:
     """Stop the run."""
     which, who = request.path_params["run"], principal(request).name
     site.metrics.stops_asked.inc()
-    return await site.at_once(lambda: site.run_view(which, site.supervisor.stop(which, who)))
+    status = await site.shared_stop(
+        f"run {which}", partial(site.supervisor.stop, which, who),
+        lambda: site.supervisor.note(who, "stop asked", which, None, joined=True))
+    return await site.at_once(partial(site.run_view, which, status))
 
 
 async def sign_off(site: Site, request: Request, body: SignOffBody) -> RunView:

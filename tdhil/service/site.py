@@ -40,7 +40,7 @@ from tdhil.service.uploads import TRACE, Uploads
 
 T = TypeVar("T")
 STOPS: Final = 16
-"""Largest number of simultaneous stops. Each has its own thread, which is started in advance."""
+"""Number of threads for stops that are started in advance. Each further stop starts a thread of its own."""
 LEASES: Final = 8
 """Number of threads for leases of watched runs, in addition to the web's other threads."""
 
@@ -97,6 +97,8 @@ class Site:
         self.records = RunRecords(supervisor, lambda run: any(one == run for one, _ in tuple(self.waiting_replays)))
         self.tasks: set[asyncio.Task[None]] = set()
         self._stops = ThreadPoolExecutor(STOPS, "stop")
+        self._stopping = 0
+        self._shared_stops: dict[str, asyncio.Task[Any]] = {}
         self._answers = KeptAnswers(self.store.runs)
         self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
         self._replays = anyio.CapacityLimiter(1)       # slow computations, so that no plan waits for them
@@ -110,8 +112,30 @@ class Site:
         there.wait()
 
     async def at_once(self, stop: Callable[[], T]) -> T:
-        """Run a stop in a thread of its own: it never waits for a computation, a download or the index."""
-        return await asyncio.get_running_loop().run_in_executor(self._stops, stop)
+        """Run a stop in a thread of its own: it never waits for a computation, a download, the index or another stop.
+
+        The first `STOPS` threads run already. Above them, a thread is started, which may take 200 ms.
+        """
+        self._stopping += 1
+        try:
+            if self._stopping <= STOPS:
+                return await asyncio.get_running_loop().run_in_executor(self._stops, stop)
+            return await anyio.to_thread.run_sync(stop, limiter=anyio.CapacityLimiter(1))
+        finally:
+            self._stopping -= 1
+
+    async def shared_stop(self, what: str, stop: Callable[[], T], joined: Callable[[], None]) -> T:
+        """Run a stop as `at_once`. If a stop of the same ``what`` is in progress, call ``joined`` and wait for that one.
+
+        So many requests to stop one shaft occupy one thread.
+        """
+        task: asyncio.Task[T] | None = self._shared_stops.get(what)
+        if task is None:
+            task = self._shared_stops[what] = asyncio.get_running_loop().create_task(self.at_once(stop))
+            task.add_done_callback(lambda _: self._shared_stops.pop(what))
+        else:
+            joined()
+        return await asyncio.shield(task)          # a client that disconnects ends no stop
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Compute a task, one at a time. Return its document; from the cache if it can't differ. Raises Refused."""
@@ -129,17 +153,17 @@ class Site:
 
     def rig_view(self, rig: RigFile) -> RigView:
         """Return the view of a rig, with its present user and its last run."""
+        run, blocked = self.supervisor.run_of(rig.id), self.supervisor.blocking_run(rig)
         if rig.rig is None:
-            return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem)
+            return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem, run=run, blocked_by=blocked)
         try:
             options, connection = rig.way()
             simulated = options.simulate or not connection.configured
             drive, profile, problem = connection.drive, connection.profile.name, ""
         except TdhilError as error:
-            return RigView(rig.id, rig.name, "unusable", False, rig.rig.service.motion, str(error))
-        run = self.supervisor.run_of(rig.id)
+            return RigView(rig.id, rig.name, "unusable", False, rig.rig.service.motion, str(error), run=run,
+                           blocked_by=blocked)
         holder = self.supervisor.holder(rig)
-        blocked = self.supervisor.blocking_run(rig)
         state: Literal["free", "busy", "held", "blocked"]
         state = "busy" if run else "held" if holder else "blocked" if blocked else "free"
         last = self.list_runs(rig.id, None, 10)
@@ -210,7 +234,7 @@ class Site:
         status = status or self.store.status(run)
         rig_name = request.rig or NO_RIG
         with suppress(TdhilError):
-            rig_name = self.supervisor.rigs.get(request.rig).name
+            rig_name = self.supervisor.rig(request.rig).name
         annotations = self.store.annotations(run)
         found = [name for name in ("run.mcap", TRACE, "recovered.mcap", "report.html", "result.json", "report.pdf",
                               ARCHIVE)
@@ -234,7 +258,7 @@ class Site:
     def broker_messages(self) -> dict[str, Any]:
         """Return the messages for a broker, by topic: each rig's state and latest result."""
         found: dict[str, Any] = {}
-        for rig in self.supervisor.rigs.all():
+        for rig in self.supervisor.all_rigs():
             view, run = self.rig_view(rig), None
             if view.run is not None:
                 with suppress(NotThere):

@@ -281,8 +281,16 @@ EDITABLE: Final = frozenset({
 
 
 def edited(old: str, text: str, name: str) -> tuple[str, ...]:
-    """Return the keys in which the text differs from the former file. Raises DataFileError and NotAllowed."""
-    wanted, present = parse_rig(text, name), parse_rig(old, name)
+    """Return the keys in which the text differs from the former file. Raises DataFileError and NotAllowed.
+
+    If the former file can't be used, there is nothing to compare. Then the text has the rules of a new rig.
+    """
+    wanted = parse_rig(text, name)
+    try:
+        present = parse_rig(old, name)
+    except DataFileError:
+        require_new_rig(text, name)
+        return tuple(sorted(key for key in wanted.model_dump() if wanted.line(key)))
     before, after = present.model_dump(), wanted.model_dump()
     keys = tuple(sorted(key for key in before if before[key] != after[key]))
     if beyond := [key for key in keys if key not in EDITABLE]:

@@ -29,6 +29,7 @@ from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.service.access import RequestPace
 from tdhil.service.audit import Audit
 from tdhil.service.console import Console
+from tdhil.service.limits import STOP_S
 from tdhil.service.run_channel import STOP_FILE, RunRefused, ask, lives, send_signal, stands_still, take_life
 from tdhil.service.run_state import (
     MAY_TURN,
@@ -62,8 +63,6 @@ LOOK_S: Final = 0.2
 """Interval of the check whether a run is alive, s."""
 INDEX_LOOKS: Final = 10
 """Number of checks between two tries to write a failed index entry."""
-STOP_S: Final = 60.0
-"""Longest duration of `tdhil stop` for a shaft that keeps turning, s."""
 SIMULATED_STOP: Final = "no real shaft turns: the simulated drive ended with its run"
 Say = Callable[[str], None]
 
@@ -195,6 +194,25 @@ class Supervisor:
     def ahead_of_the_index(self) -> list[str]:
         """Return the runs whose index entry is missing or out of date."""
         return [*{*self._live, *self._to_index, *self._unindexed}]
+
+    def rig(self, rig_id: str) -> RigFile:
+        """Return a rig. If its file is gone, a run that has not ended or is not signed off keeps it. Raises NotThere."""
+        try:
+            return self.rigs.get(rig_id)
+        except NotThere:
+            if self.run_of(rig_id) is None and self.blocked(rig_id) is None:
+                raise
+        return RigFile(rig_id, Path(f"{rig_id}.yaml"), "", None,
+                       f"{rig_id}.yaml was removed or renamed. Stop and sign-off act on the run of this rig")
+
+    def all_rigs(self) -> list[RigFile]:
+        """Return all rigs, and those without a file that a run keeps, as `rig`."""
+        found = {one.id: one for one in self.rigs.all()}
+        for run in (*self.live(), *tuple(self._unconfirmed)):
+            with suppress(NotThere):
+                if (name := self.store.request(run).rig) and name not in found:
+                    found[name] = self.rig(name)
+        return [one for _, one in sorted(found.items())]
 
     def run_of(self, rig_id: str) -> str | None:
         """Return the present run of a rig."""
@@ -441,7 +459,11 @@ class Supervisor:
                 raise UsageError("this rig is part of tdhil and can't be changed", where=f"rig {rig_id}",
                                  next_step="Use your own folder: tdhil serve --rigs")
             self.refuse_busy(rig)
-            before = rig.path.read_bytes()
+            try:
+                before = rig.path.read_bytes()
+            except OSError as error:
+                raise LogError(f"the rig's file can't be read ({error.strerror or error})", where=rig.path.name,
+                               next_step="Correct it on the service's computer") from error
             if sha256 != hashlib.sha256(before).hexdigest():
                 raise Conflict("the rig's file was changed meanwhile", where=rig.path.name, next_step="Load it again",
                                entry=MessageCode.CHANGED_MEANWHILE)

@@ -16,7 +16,7 @@ import pytest
 
 from tdhil.cli.main import build_parser, main
 from tdhil.errors import ExitCode
-from tdhil.service import supervisor
+from tdhil.service.limits import STOP_S
 from tdhil.service.run_channel import lives
 from tdhil.session import hold, holder_of, holders
 from tdhil.session.drive_lock import FOLDERS
@@ -128,7 +128,7 @@ def test_the_unit_stops_as_the_service_does():
     unit = settings()
     assert unit["KillMode"] == ["process"]                 # runs outlive their web, and brake in peace
     assert unit["KillSignal"] == ["SIGTERM"]
-    assert float(unit["TimeoutStopSec"][0]) > supervisor.STOP_S + 10.0
+    assert float(unit["TimeoutStopSec"][0]) > STOP_S + 10.0
     assert "ExecStop" not in unit
     assert "ExecStartPre" not in unit                      # whatever moves, a web that died comes back
     assert unit["RestartPreventExitStatus"] == [str(int(ExitCode.USAGE))]

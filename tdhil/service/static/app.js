@@ -216,7 +216,7 @@
       el("p", { class: "row" },
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, tr("Start")) : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, tr("Live")) : null,
-        rig.run || rig.state === "held" || rig.state === "blocked" ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, tr("Stop")) : null,
+        rig.run || rig.state === "held" || rig.blocked_by ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, tr("Stop")) : null,
         may("operator") ? el("a", { class: "button quiet", href: `/calibrate/${encodeURIComponent(rig.id)}` }, tr("Calibrate")) : null,
         may("operator") && rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, tr("Rehearse")) : null,
         rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, tr("History")) : null,
@@ -227,7 +227,7 @@
   async function stopRig(rig) {
     const late = setTimeout(() => away(tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })), SILENT_MS);
     try {
-      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : 90000);      // without a run the answer comes after standstill
+      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : Number(document.body.dataset.stopS) * 1000 + 10000);      // without a run the answer comes after standstill
       if (byId("away").textContent.includes(UNDELIVERED)) away("");
       if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
       else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired stop")}`}`);
