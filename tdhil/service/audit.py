@@ -4,6 +4,7 @@
 
     audit/<year>-<month>.jsonl     one line per entry, with the hash of the line before and its own hash
     audit/head.json                number and hash of the last line, sealed
+    audit.lock                     held by the web while it writes a line, so that a reader sees whole entries
     audit.key                      the key, and the anchor: number and hash of the last line; mode 0600
 
 A line's hash is an HMAC-SHA256 with the key. Without the key, each of these changes is detected: a line was changed,
@@ -28,6 +29,7 @@ import re
 import secrets
 import threading
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -37,6 +39,7 @@ from tdhil.service.run_state import now
 from tdhil.service.store import read_json, write_json
 
 KEY_FILE: Final = "audit.key"
+LOCK_FILE: Final = "audit.lock"
 FIRST: Final = "0" * 64
 _HEAD: Final = re.compile(r"([0-9]{1,12}):([0-9a-f]{64})")
 
@@ -120,19 +123,19 @@ class Audit:
 
     def begin(self) -> None:
         """Make the key if there is none. Lines from before it are accepted unchecked. Raises OSError."""
-        with self._lock:
+        with self._lock, self._alone(write=True):
             self._sealed()
 
     def note(
         self, who: str, what: str, *, run: str | None = None, rig: str | None = None, **details: Any
     ) -> None:
         """Add a line. It is on the disk when this returns. Raises OSError."""
-        with self._lock:
+        with self._lock, self._alone(write=True):
             self._add(self._sealed(), who, what, run, rig, details)
 
     def head(self) -> ChainHead | None:
         """Return the last line, for export; None if there is none, or if the chain's end is broken."""
-        with self._lock:
+        with self._lock, self._alone():
             seal = self._seal or self._read()
             found = None if seal is None else self._end(seal)
         return found if found is not None and found.number > 0 else None
@@ -153,7 +156,7 @@ class Audit:
 
         ``kept``: a head that was exported before. It must be one of the lines.
         """
-        with self._lock:
+        with self._lock, self._alone():
             return self._verify(self._seal or self._read(), kept)
 
     def _verify(self, seal: _Seal | None, kept: ChainHead | None) -> Broken | None:
@@ -186,6 +189,25 @@ class Audit:
         if head not in ends or not (sealed or head.number <= seal.plain):
             return Broken(*at, f"the chain ends with line {number}, but head.json names another head")
         return None
+
+    @contextmanager
+    def _alone(self, *, write: bool = False) -> Iterator[None]:
+        """Let no other process write the chain meanwhile: line, head and anchor change one after the other.
+
+        A copy of the chain that can't be locked, such as on a read-only medium, is read without a lock.
+        """
+        descriptor = None
+        with suppress(OSError, ImportError):
+            import fcntl
+
+            flags = os.O_RDWR | os.O_CREAT if write else os.O_RDONLY
+            descriptor = os.open(self._key_path.with_name(LOCK_FILE), flags | os.O_CLOEXEC, 0o600)
+            fcntl.flock(descriptor, fcntl.LOCK_EX if write else fcntl.LOCK_SH)
+        try:
+            yield
+        finally:
+            if descriptor is not None:
+                os.close(descriptor)
 
     def _add(
         self, seal: _Seal, who: str, what: str, run: str | None, rig: str | None, details: Mapping[str, Any]

@@ -12,7 +12,7 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.service.acceptance_signature import FILE
 from tdhil.service.access import principal
 from tdhil.service.letterhead import outdated_reports
-from tdhil.service.middleware import off
+from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere
 from tdhil.service.schemas import PictureView
@@ -106,7 +106,7 @@ async def picture(site: Site, request: Request, body: None) -> Response:
     """Return one picture of the report. Raises NotThere."""
     number = request.path_params["number"]
     found = await _shown(site, request.path_params["run"])
-    if not number.isdecimal() or int(number) >= len(found):
+    if whole_number(number, 0, len(found) - 1) is None:
         raise NotThere("this picture does not exist", where=f"run {request.path_params['run']}")
     said = {"content-security-policy": PICTURE_POLICY}
     return Response(found[int(number)].svg, media_type="image/svg+xml", headers=said)

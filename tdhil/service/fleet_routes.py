@@ -9,7 +9,7 @@ from starlette.responses import FileResponse, Response
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import principal
 from tdhil.service.fleets import TABLE, FleetView
-from tdhil.service.middleware import off
+from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import api
 from tdhil.service.run_routes import settings_of
 from tdhil.service.schemas import FleetBody
@@ -71,7 +71,7 @@ async def fleet_rows(site: Site, request: Request, body: None) -> list[dict[str,
     start, limit = query.get("from", "0"), query.get("limit", "200")
     if not start.isdecimal() or len(start) > 9:
         raise UsageError("must be a number", where="from", entry=MessageCode.REQUEST_WRONG)
-    if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
+    if whole_number(limit, 1, 1000) is None:
         raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
     return await off(lambda: site.fleets.rows(request.path_params["fleet"], int(start), int(limit)))
 

@@ -34,6 +34,7 @@ from tdhil.service.run_state import (
     TooLarge,
     TooManyTries,
     TooSlow,
+    disk_full,
 )
 from tdhil.service.schemas import FILE, OBJECTS, ErrorView, FieldError, Route, adapter, plain
 from tdhil.service.start_request import ValuesWrong
@@ -46,6 +47,8 @@ POLICY: Final = (
 )
 """Content security policy of every page: nothing from elsewhere, no script or style in the page itself."""
 _NONE: Final[Mapping[str, str]] = MappingProxyType({})
+LONGEST_WHOLE: Final = 300
+"""Most digits of a whole number in a request. A double has at most 309, and Python refuses more than 4300."""
 _BROKEN_HINT: Final = "See the terminal of tdhil serve"
 
 
@@ -110,6 +113,7 @@ async def _with_headers(send: Send, message: Message) -> None:
 
 def status_of(error: BaseException) -> int:
     """Return the HTTP status of an error in the error tree."""
+    error = disk_full(error) or error
     if isinstance(error, HTTPException):
         return int(error.status_code)
     for kind, status in (
@@ -121,12 +125,15 @@ def status_of(error: BaseException) -> int:
         if isinstance(error, kind):
             return status
     if isinstance(error, RunRefused):
+        if error.reported.code == NoRoom.entry.code:
+            return 507
         return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.reported.exit_code), 500)
     return 500
 
 
 def error_view(error: BaseException) -> ErrorView:
     """Return the reply's body for an error."""
+    error = disk_full(error) or error
     if isinstance(error, RunRefused):
         return ErrorView(error.reported)
     if isinstance(error, HTTPException):
@@ -171,12 +178,15 @@ async def body_of(request: Request, route: Route) -> Any:
         raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Use application/json",
                          entry=MessageCode.REQUEST_WRONG)
     try:
-        sent = json.loads(data or b"{}", parse_constant=_no_number)
+        sent = json.loads(data or b"{}", parse_constant=_no_number, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise UsageError(f"is not JSON ({str(error)[:100]})", where="body", entry=MessageCode.REQUEST_WRONG) from None
     if not isinstance(sent, dict):
         raise UsageError("must be an object", where="body", next_step='Send an object, such as {"seed": 7}',
                          entry=MessageCode.REQUEST_WRONG)
+    if (where := _not_text(sent)) is not None:
+        raise UsageError("contains half of a UTF-16 surrogate pair, which is no character", where=where[:60] or "body",
+                         next_step="Nothing was changed. Enter the text again", entry=MessageCode.REQUEST_WRONG)
     if route.body in OBJECTS:
         return sent
     try:
@@ -189,6 +199,33 @@ async def body_of(request: Request, route: Route) -> Any:
             raise UsageError("is not a field of this request", where=where, next_step=f"Fields: {known}",
                              entry=MessageCode.REQUEST_WRONG) from None
         raise UsageError(first["msg"], where=where, entry=MessageCode.REQUEST_WRONG) from None
+
+
+def _whole(text: str) -> int:
+    if len(text) > LONGEST_WHOLE:
+        raise ValueError(f"a number has {len(text)} digits; the limit is {LONGEST_WHOLE}")
+    return int(text)
+
+
+def whole_number(text: str, least: int, most: int) -> int | None:
+    """Return the whole number; None if it is none, or outside the limits. Python refuses more than 4300 digits."""
+    if not text.isdecimal() or len(text) > len(str(most)):
+        return None
+    return int(text) if least <= int(text) <= most else None
+
+
+def _not_text(sent: Any, where: str = "") -> str | None:
+    """Return the field of the first text that UTF-8 can't express, such as ``tags.0``; None without one."""
+    if isinstance(sent, str):
+        return where if any("\ud800" <= one <= "\udfff" for one in sent) else None
+    pairs = sent.items() if isinstance(sent, dict) else enumerate(sent) if isinstance(sent, list) else ()
+    for name, value in pairs:
+        if _not_text(name) is not None:
+            return where or "body"
+        found = _not_text(value, f"{where}.{name}" if where else str(name))
+        if found is not None:
+            return found
+    return None
 
 
 def _no_number(name: str) -> Any:

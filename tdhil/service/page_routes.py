@@ -61,7 +61,8 @@ class Pages:
             lstrip_blocks=True,
         )
         found.globals.update(
-            version=__version__, stop_s=STOP_S, form_options=form_options, stated_options=[OPTION[name] for name in STATED],
+            version=__version__, stop_s=STOP_S, form_options=form_options,
+            stated_options=[OPTION[name] for name in STATED],
             language=language, languages=self._languages.values(),
             graphs=GRAPHS, _=language.text, word=language.word, hint=lambda option: _hint(language, option),
             code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,

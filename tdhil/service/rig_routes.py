@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from starlette.routing import Route
 
     from tdhil.service.site import Site
+    from tdhil.session import Holder
 
 LARGEST_KG_M2: Final = 1e9
 """Largest added moment of inertia that a calibration accepts, kg·m²; no body has more."""
@@ -156,23 +157,25 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
     who = asking.name
     site.metrics.stops_asked.inc()
 
-    def look() -> tuple[str | None, RigFile | None]:
+    def look() -> tuple[str | None, Holder | None, RigFile | None]:
         if (run := site.supervisor.run_of(which)) is not None:
-            return run, None
+            return run, site.supervisor.held_beside(run), None
         found = site.supervisor.rig(which)
         if "operator" not in asking.roles and site.supervisor.certainly_idle(found):
             raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that another"
                              " program may control", where=f"rig {which}",
                              next_step="Ask an operator. If the shaft turns, use the hard-wired stop")
-        return None, found
+        return None, None, found
 
     def noted() -> None:
         site.supervisor.note(who, "stop asked", run, which, joined=True)
 
-    run, found = await site.at_once(look)          # for each request: a run may have begun since another stop
+    run, holder, found = await site.at_once(look)          # for each request: a run may have begun since another stop
     if run is not None:
+        drive = site.stop_beside(run, holder, who)
         await site.shared_stop(f"run {run}", partial(site.supervisor.stop, run, who), noted)
-        return StoppedView(which, [run])
+        code, said = (None, "") if drive is None else await drive
+        return StoppedView(which, [run], code, said)
     assert found is not None
     code, said = await site.shared_stop(f"rig {which}", partial(site.supervisor.stop_drive, found, who), noted)
     return StoppedView(which, [], code, said)

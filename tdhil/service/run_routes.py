@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import traceback
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -14,7 +15,7 @@ from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
-from tdhil.service.middleware import error_view, off
+from tdhil.service.middleware import error_view, off, whole_number
 from tdhil.service.routing import api
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
@@ -74,7 +75,7 @@ async def runs(site: Site, request: Request, body: None) -> list[Summary]:
     """Return the runs, the newest first."""
     query = request.query_params
     limit = query.get("limit", "100")
-    if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
+    if whole_number(limit, 1, 1000) is None:
         raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
     if (state := query.get("state")) is not None and state not in set(State):
         raise UsageError(f"{state[:40]!r} is not a state", where="state",
@@ -157,6 +158,7 @@ async def stop(site: Site, request: Request, body: Any) -> RunView:
     """Stop the run."""
     which, who = request.path_params["run"], principal(request).name
     site.metrics.stops_asked.inc()
+    site.stop_beside(which, await site.at_once(partial(site.supervisor.held_beside, which)), who)
     status = await site.shared_stop(
         f"run {which}", partial(site.supervisor.stop, which, who),
         lambda: site.supervisor.note(who, "stop asked", which, None, joined=True))
@@ -264,18 +266,25 @@ def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> Repl
 
 async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
     """Execute a replay as soon as no shaft of this service may turn."""
-    while await off(site.supervisor.turning):
-        await anyio.sleep(0.5)
     try:
+        while await off(site.supervisor.turning):
+            await anyio.sleep(0.5)
         found = await site.work("replay", which, view.asked)
         done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
     except TdhilError as error:
         done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=error_view(error).error)
-    path = site.store.place(which) / "replays" / f"{view.name}.json"
+    except Exception as error:                 # such as no memory for a process: the page must not wait for ever
+        traceback.print_exception(error)
+        what = f"the replay can't be computed ({getattr(error, 'strerror', None) or error})"
+        done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=error_view(
+            LogError(what, where=f"run {which}", next_step="Repeat it later")).error)
+    name = f"{view.name}.json"
     try:
-        await off(lambda: write_json(path, plain(done, ReplayView)))
+        await off(lambda: write_json(site.store.place(which) / "replays" / name, plain(done, ReplayView)))
+    except NotThere:                           # the run was deleted meanwhile
+        site.waiting_replays.pop((which, view.name), None)
     except OSError as error:
-        lost = error_view(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
+        lost = error_view(LogError(f"the replay can't be written ({error.strerror or error})", where=name)).error
         site.waiting_replays[which, view.name] = ReplayView(
             view.name, view.asked, view.at, view.by, "failed", error=lost)
     else:

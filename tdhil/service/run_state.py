@@ -12,11 +12,12 @@ one state, done.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
 
 from drivers import CommunicationLost, PreflightRefused
 from tdhil.errors import HIGHEST_SIGNAL, SIGNALS, ExitCode, MessageCode, TdhilError, UsageError
@@ -310,12 +311,26 @@ class TooManyRuns(TooManyTries):
         self.wait_s = wait_s
 
 
+FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Numbers of the system's errors for a full disk and a used-up quota."""
+
+
 class NoRoom(TdhilError):
     """The disk is full."""
 
     entry = MessageCode.SERVICE_DISK_FULL
 
     exit_code = ExitCode.REFUSED
+
+
+def disk_full(error: BaseException) -> NoRoom | None:
+    """Return the refusal for an error that a full disk caused, also as its cause; None for any other error."""
+    for one in (error, error.__cause__):
+        if isinstance(one, OSError) and one.errno in FULL and not isinstance(error, NoRoom):
+            what, where = getattr(error, "what", ""), getattr(error, "where", "")
+            return NoRoom(what or f"the disk is full ({one.strerror})", where=where,
+                          next_step="Free some disk space, then repeat the request")
+    return None
 
 
 class NotReacting(CommunicationLost):

@@ -27,6 +27,9 @@ from tdhil.service.upload_request import ACCEPTED
 from tdhil.service.uploads import Upload
 from tdhil.version import __version__
 
+NO_ROOM: Final = 507
+"""HTTP status of a full disk: any request that writes a file may get it."""
+
 # For mypy these are plain dataclasses; pydantic makes the schemas from their annotations.
 
 
@@ -300,7 +303,10 @@ class FaultView:
 
 @dataclass(frozen=True)
 class StoppedView:
-    """A stop of a rig: its runs, or without a run the outcome of `tdhil stop` (exit code 0: standstill)."""
+    """A stop of a rig: its run, and the outcome of `tdhil stop` on its drive (exit code 0: standstill).
+
+    `tdhil stop` is used without a run, and if another program holds the drive while the run is identified.
+    """
 
     rig: str
     runs: list[str]
@@ -863,7 +869,8 @@ def document() -> dict[str, Any]:
             content: dict[str, Any] = {media: {} for media in files} or {"application/json": {"schema": schema(kind)}}
             responses[str(code)] = {"description": route.summary, "content": content}
         closed = () if route.role is None else (401, 403)
-        responses |= {str(code): error for code in sorted({*route.errors, *closed})}
+        writes = () if route.method == "GET" else (NO_ROOM,)
+        responses |= {str(code): error for code in sorted({*route.errors, *closed, *writes})}
         parameters = [
             {"name": part[1:-1], "in": "path", "required": True, "schema": {"type": "string"}}
             for part in route.path.split("/") if part.startswith("{")

@@ -231,7 +231,7 @@ def check_idle(data: Path, say: Say) -> int:
     """
     from tdhil.service.run_channel import lives
     from tdhil.service.run_state import State
-    from tdhil.service.store import Store
+    from tdhil.service.store import CONNECTION_FILE, Store
     from tdhil.session import holders
 
     store = Store(data.resolve())
@@ -239,10 +239,16 @@ def check_idle(data: Path, say: Say) -> int:
     if not busy:
         require_folder(data)
     for run in store.ids():
-        if lives(store.place(run)):
-            busy.append(f"run {run} has not ended")
-        elif store.status(run).state is State.STOP_NOT_CONFIRMED and store.signed_off(run) is None:
-            busy.append(f"the stop of run {run} is neither confirmed nor signed off")
+        try:
+            if lives(store.place(run)):
+                busy.append(f"run {run} has not ended")
+            elif store.status(run).state is State.STOP_NOT_CONFIRMED and store.signed_off(run) is None:
+                busy.append(f"the stop of run {run} is neither confirmed nor signed off")
+        except Exception as error:             # a broken folder of one run: the others are still checked
+            if (store.runs / run / CONNECTION_FILE).exists():
+                busy.append(f"run {run} used a drive, and its state can't be read ({error})")
+            else:
+                say(f"run {run} is left out: its files can't be read, and it used no drive ({error})")
     for one in busy:
         say(f"not idle: {one}")
     return int(ExitCode.REFUSED if busy else ExitCode.OK)

@@ -14,7 +14,7 @@ from tdhil.service import letterhead as letterheads
 from tdhil.service.access import principal
 from tdhil.service.audit import ChainHead
 from tdhil.service.letterhead import stored_letterhead
-from tdhil.service.middleware import off
+from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import api
 from tdhil.service.schemas import AuditView, HealthView, LetterheadBody, LetterheadView, document
 from tdhil.version import __version__
@@ -43,7 +43,7 @@ def routes(site: Site) -> list[Route]:
 async def audit(site: Site, request: Request, body: None) -> AuditView:
     """Return the newest lines of the audit, and whether its chain is intact."""
     limit = request.query_params.get("limit", "200")
-    if not limit.isdecimal() or not 1 <= int(limit) <= 5000:
+    if whole_number(limit, 1, 5000) is None:
         raise UsageError("must be 1 to 5000", where="limit", entry=MessageCode.REQUEST_WRONG)
 
     given = request.query_params.get("head")

@@ -37,6 +37,7 @@ from tdhil.service.start_request import RigFile
 from tdhil.service.store import Summary, read_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.uploads import TRACE, Uploads
+from tdhil.session import Holder
 
 T = TypeVar("T")
 STOPS: Final = 16
@@ -95,7 +96,7 @@ class Site:
         self.waiting_replays: dict[tuple[str, str], ReplayView] = {}
         self.replay_names = threading.Lock()
         self.records = RunRecords(supervisor, lambda run: any(one == run for one, _ in tuple(self.waiting_replays)))
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.tasks: set[asyncio.Task[Any]] = set()
         self._stops = ThreadPoolExecutor(STOPS, "stop")
         self._stopping = 0
         self._shared_stops: dict[str, asyncio.Task[Any]] = {}
@@ -120,12 +121,13 @@ class Site:
         try:
             if self._stopping <= STOPS:
                 return await asyncio.get_running_loop().run_in_executor(self._stops, stop)
-            return await anyio.to_thread.run_sync(stop, limiter=anyio.CapacityLimiter(1))
+            found: T = await anyio.to_thread.run_sync(stop, limiter=anyio.CapacityLimiter(1))
+            return found
         finally:
             self._stopping -= 1
 
     async def shared_stop(self, what: str, stop: Callable[[], T], joined: Callable[[], None]) -> T:
-        """Run a stop as `at_once`. If a stop of the same ``what`` is in progress, call ``joined`` and wait for that one.
+        """Run a stop as `at_once`. If a stop of ``what`` is in progress, call ``joined`` and wait for that one.
 
         So many requests to stop one shaft occupy one thread.
         """
@@ -136,6 +138,17 @@ class Site:
         else:
             joined()
         return await asyncio.shield(task)          # a client that disconnects ends no stop
+
+    def stop_beside(self, run: str, holder: Holder | None, who: str) -> asyncio.Task[tuple[int, str]] | None:
+        """Begin to stop the drive of a run that another program holds. Return the stop; None without a holder."""
+        if holder is None:
+            return None
+        task = asyncio.get_running_loop().create_task(self.shared_stop(
+            f"beside {run}", partial(self.supervisor.stop_beside, run, holder, who),
+            lambda: self.supervisor.note(who, "stop asked", run, None, joined=True)))
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+        return task
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Compute a task, one at a time. Return its document; from the cache if it can't differ. Raises Refused."""

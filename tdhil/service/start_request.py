@@ -280,15 +280,15 @@ EDITABLE: Final = frozenset({
 """Keys of a rig's file that HTTP may change. The drive's address and type, and the rules of motion, are no part."""
 
 
-def edited(old: str, text: str, name: str) -> tuple[str, ...]:
+def edited(old: bytes, text: str, name: str) -> tuple[str, ...]:
     """Return the keys in which the text differs from the former file. Raises DataFileError and NotAllowed.
 
     If the former file can't be used, there is nothing to compare. Then the text has the rules of a new rig.
     """
     wanted = parse_rig(text, name)
     try:
-        present = parse_rig(old, name)
-    except DataFileError:
+        present = parse_rig(old.decode(), name)
+    except (DataFileError, UnicodeDecodeError):
         require_new_rig(text, name)
         return tuple(sorted(key for key in wanted.model_dump() if wanted.line(key)))
     before, after = present.model_dump(), wanted.model_dump()

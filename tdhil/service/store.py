@@ -63,6 +63,17 @@ def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
     _sync_folder(path.parent)
 
 
+def write_new(path: Path, data: bytes) -> None:
+    """Write a new file as a whole or not at all. Raises FileExistsError, and OSError."""
+    whole = path.with_name(f".{path.name}.new.{os.getpid()}.{threading.get_ident()}")
+    try:
+        write_whole(whole, data)
+        os.link(whole, path)                   # unlike a rename, it never replaces a file
+    finally:
+        whole.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
 def write_json(path: Path, plain: Mapping[str, Any], mode: int | None = None) -> None:
     """Write a JSON object atomically. ``mode``: permissions of the file. Raises OSError."""
     write_whole(path, json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False).encode() + b"\n", mode)

@@ -6,7 +6,6 @@ after a restart, a web that was killed finds all runs again. A restart moves not
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -32,6 +31,7 @@ from tdhil.service.console import Console
 from tdhil.service.limits import STOP_S
 from tdhil.service.run_channel import STOP_FILE, RunRefused, ask, lives, send_signal, stands_still, take_life
 from tdhil.service.run_state import (
+    FULL,
     MAY_TURN,
     Conflict,
     NoRoom,
@@ -56,7 +56,17 @@ from tdhil.service.start_request import (
     require_motion,
     require_new_rig,
 )
-from tdhil.service.store import CONNECTION_FILE, KEYS, Index, Store, StoredRequest, read_json, write_json, write_whole
+from tdhil.service.store import (
+    CONNECTION_FILE,
+    KEYS,
+    Index,
+    Store,
+    StoredRequest,
+    read_json,
+    write_json,
+    write_new,
+    write_whole,
+)
 from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
@@ -196,7 +206,7 @@ class Supervisor:
         return [*{*self._live, *self._to_index, *self._unindexed}]
 
     def rig(self, rig_id: str) -> RigFile:
-        """Return a rig. If its file is gone, a run that has not ended or is not signed off keeps it. Raises NotThere."""
+        """Return a rig. Without its file, a run that is not ended or not signed off keeps it. Raises NotThere."""
         try:
             return self.rigs.get(rig_id)
         except NotThere:
@@ -272,7 +282,7 @@ class Supervisor:
                 shutil.rmtree(self.store.runs / run, ignore_errors=True)
             what = f"the run's request can't be written ({error.strerror or error})"
             where = f"--data {self.store.folder}"
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno in FULL:
                 raise NoRoom(what, where=where, next_step="Nothing was started. Free some disk space") from error
             raise LogError(what, where=where, next_step="Nothing was started. Check that folder") from error
         return request
@@ -400,6 +410,23 @@ class Supervisor:
             f" The drive's watchdog{watchdog} stops the shaft. {done}", where=f"run {status.id}",
             next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired stop")
 
+    def held_beside(self, run: str) -> Holder | None:
+        """Return the other program that holds the drive of a run whose motion is over. Raises NotThere.
+
+        Such a run holds no drive itself, so a stop of the run does not reach the shaft.
+        """
+        identifying = self.store.status(run).state is State.IDENTIFYING
+        return holder_of(self._address_of(run)) if identifying else None
+
+    def stop_beside(self, run: str, holder: Holder, who: str) -> tuple[int, str]:
+        """Run `tdhil stop` on the drive of a run that another program holds. Return the exit code and a text."""
+        status = self.store.status(run)
+        self.note(who, "stop asked", run, status.rig, drive_held_by=str(holder))
+        seen, said = self._stop_drive_of(self.store.request(run), status)
+        said = f"the motion of run {run} is over, and the drive is held by {holder}: {said}"
+        self.say(said)
+        return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
+
     def stop_drive(self, rig: RigFile, who: str) -> tuple[int, str]:
         """Run `tdhil stop` on a rig without a run of this service. Return the exit code and a text.
 
@@ -467,7 +494,7 @@ class Supervisor:
             if sha256 != hashlib.sha256(before).hexdigest():
                 raise Conflict("the rig's file was changed meanwhile", where=rig.path.name, next_step="Load it again",
                                entry=MessageCode.CHANGED_MEANWHILE)
-            keys = edited(before.decode("utf-8", "replace"), text, rig.path.name)
+            keys = edited(before, text, rig.path.name)
             try:
                 kept = self.store.folder / "rigs" / rig.id / f"{sha256}.yaml"
                 kept.parent.mkdir(parents=True, exist_ok=True, mode=0o750)
@@ -496,10 +523,7 @@ class Supervisor:
         path = folder / f"{rig_id}.yaml"
         require_new_rig(text, path.name)
         try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
+            write_new(path, text.encode())
         except FileExistsError:
             raise Conflict("this rig exists already", where=f"rig {rig_id}", next_step="Choose another id") from None
         except OSError as error:

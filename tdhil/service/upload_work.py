@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -46,12 +47,12 @@ def read_upload(kind: str, options: Mapping[str, Any]) -> RunRecord:
     from tdhil.session import is_evaluation, is_verification, read, trace_arguments
 
     if kind == "trace":
-        motion = Path(MOTION)
-        motion.unlink(missing_ok=True)
-        if options.get("excitation"):
+        if not options.get("excitation"):
+            return read(TRACE, **trace_arguments({**options, "excitation": None}, "the upload"))
+        with TemporaryDirectory(prefix=".motion.", dir=".") as own:        # a preview may run beside an identification
+            motion = Path(own) / MOTION
             motion.write_text(options["excitation"], encoding="utf-8")
-        given = {**options, "excitation": MOTION if options.get("excitation") else None}
-        return read(TRACE, **trace_arguments(given, "the upload"))
+            return read(TRACE, **trace_arguments({**options, "excitation": str(motion)}, "the upload"))
     record = read(LOG)
     record.require_motion()
     if is_evaluation(record.configuration) or is_verification(record.configuration):

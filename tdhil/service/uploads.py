@@ -12,7 +12,6 @@ never blocks a rig and never stops. The name of the uploaded file is a text. It 
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import re
@@ -29,7 +28,7 @@ from typing import Any, BinaryIO, Final, Literal
 from profiles import visible
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.limits import MEBIBYTE, UPLOAD_LIMIT
-from tdhil.service.run_state import Conflict, NoRoom, NotThere, Status, Told, TooLarge, now
+from tdhil.service.run_state import FULL, Conflict, NoRoom, NotThere, Status, Told, TooLarge, now
 from tdhil.service.store import Store, StoredRequest, read_json, write_json
 
 AT_ONCE: Final = 2
@@ -52,7 +51,6 @@ MOTION: Final = "excitation.yaml"
 _ID: Final = re.compile(r"[0-9a-f]{16}")
 _ABOUT: Final = "upload.json"
 _RAW: Final = "received"
-_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 UploadState = Literal["waiting", "delayed", "identifying", "failed", "done"]
 """States: waits for a person; waits until no real shaft turns; is identified; could not be identified; is a run."""
 BUSY: Final = frozenset({"delayed", "identifying"})
@@ -336,7 +334,7 @@ def _disk(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
+        if error.errno in FULL:
             raise _no_room() from error
         raise LogError(f"the upload can't be written ({error.strerror or error})", where=name,
                        next_step="Check the folder of the service") from error

@@ -48,7 +48,7 @@ from tdhil.service.live_feed import Feed
 from tdhil.service.middleware import RequestGuard, error_response, error_view, off, status_of
 from tdhil.service.page_routes import Pages
 from tdhil.service.run_channel import tell_viewed
-from tdhil.service.run_state import NotLoggedIn, NotThere
+from tdhil.service.run_state import NotLoggedIn, NotThere, disk_full
 from tdhil.service.schemas import API, SOCKETS
 from tdhil.service.site import Site
 from tdhil.service.supervisor import Supervisor
@@ -103,6 +103,8 @@ class Web(Site):
         if isinstance(error, OSError) and error.errno in NO_DESCRIPTOR:
             error = LogError(f"the service has no descriptor left ({error.strerror})", where=request.url.path[:100],
                              next_step="Repeat the request. Raise the limit of open files (LimitNOFILE, ulimit -n)")
+            self._complain("A request failed: {}", error)
+        elif disk_full(error) is not None:
             self._complain("A request failed: {}", error)
         elif not isinstance(error, TdhilError | HTTPException):
             import traceback

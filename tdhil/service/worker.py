@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from tdhil.errors import UsageError
 from tdhil.numerics import prepare
-from tdhil.service.run_state import Told
+from tdhil.service.run_state import Told, disk_full
 
 NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "scan": 0, "pace": 0}
 """Nice values of the tasks for which a page waits. A run by the clock has 0."""
@@ -212,7 +212,7 @@ def main(arguments: list[str]) -> int:
             import traceback
 
             traceback.print_exception(error)
-        answer = {"error": Told.of(error).__dict__}
+        answer = {"error": Told.of(disk_full(error) or error).__dict__}
     json.dump(answer, out)
     out.flush()
     return 0

@@ -3,7 +3,8 @@
 ``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, and is not seen at rest then) | ``ask`` (wants
 the code first; where its rig is watched, it then moves until it is stopped, or watched no more) | ``patient`` (the
 same, whose lease counts the time from when its page says that it goes: a test of it has all the time that it takes) |
-``frozen`` (hears no stop) | ``die`` (killed while it moves)
+``frozen`` (hears no stop) | ``identify`` (its motion is over, and it computes until it is stopped) | ``die``
+(killed while it moves)
 """
 
 from __future__ import annotations
@@ -94,7 +95,13 @@ def main(folder: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         while what in ("hold", "loose", "deaf", "frozen") and not stop.asked:
             time.sleep(0.01)
-        if stop.asked and what != "loose":
+        if what == "identify":
+            board.to(State.STOPPING)
+            board.to(State.IDENTIFYING)
+            while not stop.asked:
+                time.sleep(0.01)
+            end(board, State.FAILED, 143)
+        elif stop.asked and what != "loose":
             end(board, State.STOPPED, 143)
         elif what in ("unseen", "loose"):
             end(board, State.STOP_NOT_CONFIRMED, 8)

@@ -472,14 +472,14 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
 
 def test_expected_values_of_an_acceptance_are_edited_over_http():
     before = "name: bench 3\nrun: {simulate: true}\n"
-    assert edited(before, before + "acceptance: {inertia: 104 kg·m² ± 5 %}\n", "a.yaml") == ("acceptance",)
+    assert edited(before.encode(), before + "acceptance: {inertia: 104 kg·m² ± 5 %}\n", "a.yaml") == ("acceptance",)
 
 
 def test_a_file_that_was_named_on_the_service_s_computer_stays_and_no_other_is_named_over_http():
     before = "name: bench 3\nrun: {simulate: true, plant: ../plant.yaml}\ndrive_data: {torque_calibration: ../c.json}\n"
-    assert edited(before, before.replace("bench 3", "bench 4"), "a.yaml") == ("name",)
+    assert edited(before.encode(), before.replace("bench 3", "bench 4"), "a.yaml") == ("name",)
     with pytest.raises(NotAllowed, match="beside the rig's file"):
-        edited(before, before.replace("../c.json", "/etc/c.json"), "a.yaml")
+        edited(before.encode(), before.replace("../c.json", "/etc/c.json"), "a.yaml")
 
 
 @pytest.mark.heavy

@@ -719,7 +719,7 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
 
     with monkeypatch.context() as patched:
         patched.setattr("tdhil.service.supervisor.take_life", full)
-        assert "can't be started" in call.start(expect=409)["error"]["what"]
+        assert "can't be started" in call.start(expect=507)["error"]["what"]
     (run,) = service.store.ids()
     assert service.store.status(run).state is State.FAILED
     assert service.supervisor.live() == []

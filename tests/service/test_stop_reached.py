@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,8 @@ from tdhil.service import supervisor as supervisor_module
 from tdhil.service.run_state import State
 from tdhil.service.schemas import API
 from tdhil.service.site import STOPS
+from tdhil.service.store import CONNECTION_FILE, write_json
+from tdhil.session import hold, kept_connection
 from tests.service.conftest import HANGS_S, Checked, Service, wait_for
 
 BROKEN = "limits: [\n"
@@ -169,3 +172,30 @@ def test_a_file_that_cannot_be_used_is_repaired_as_a_new_rig_is_added(call, serv
     service.supervisor.edit_rig("real", good, found["sha256"], "anna")
     assert path.read_text() == good
     assert (service.store.folder / "rigs" / "real" / f"{found['sha256']}.yaml").read_bytes() == broken
+
+
+# -- another program moves the shaft while the run is identified
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("path", ["/rigs/real/stop", "/runs/{run}/stop"])
+def test_a_stop_reaches_the_shaft_that_another_program_moves_while_the_run_is_identified(
+    call, service, monkeypatch, path,
+):
+    rig = service.supervisor.rigs.get("real")
+    stopped: list[str] = []
+    monkeypatch.setattr(service.supervisor, "_stop_drive_of",
+                        lambda request, status: stopped.append(request.id) or (True, "standstill"))
+    for held in (False, True):
+        run = call.start("real", "identify")["id"]
+        write_json(service.store.place(run) / CONNECTION_FILE, kept_connection(*rig.way()))
+        service.wait(run, "identifying")
+        with hold(rig.address) if held else nullcontext():
+            found = call("POST", path.format(run=run), 200, json={})
+            if "said" in found:
+                assert (found["exit_code"], "the drive is held by" in found["said"]) == ((0, True) if held
+                                                                                         else (None, False))
+            service.wait(run, "failed")
+            wait_for("the stop of the drive", lambda held=held, run=run: not held or stopped == [run])
+        wait_for("its end", lambda: not service.supervisor.live())
+        assert stopped == ([run] if held else [])

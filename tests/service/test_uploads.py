@@ -354,3 +354,27 @@ def test_an_identified_trace_is_marked_as_uploaded_in_every_document(call, servi
     assert again["kind"] == "log"
     preview = call("POST", f"/uploads/{again['id']}/preview", 200, json={})["preview"]
     assert preview["reading"]["samples"] == len(time_s) and preview["run"]["operator"] == "Anna"
+
+
+def test_a_preview_leaves_the_motion_of_a_running_identification_as_it_is(tmp_path, monkeypatch):
+    """The identification reads the trace after its motion was written; a preview of another form may come between."""
+    from tdhil import session
+    from tdhil.service.upload_work import read_upload
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "trace.csv").write_bytes(TRACE)
+    seen: list[str] = []
+
+    def read(name: str, *, excitation: str | None = None, **more: Any) -> Any:
+        if excitation is not None and not seen:
+            seen.append("")
+            read_upload("trace", {"excitation": "kind: other\n"})
+            read_upload("trace", {})
+        seen.append("" if excitation is None else (tmp_path / excitation).read_text())
+        return None
+
+    monkeypatch.setattr(session, "read", read)
+    monkeypatch.setattr(session, "trace_arguments", lambda given, where: {"excitation": given["excitation"]})
+    read_upload("trace", {"excitation": "kind: mine\n"})
+    assert seen == ["", "kind: other\n", "", "kind: mine\n"]
+    assert [one.name for one in tmp_path.iterdir()] == ["trace.csv"]

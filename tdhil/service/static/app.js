@@ -227,9 +227,9 @@
   async function stopRig(rig) {
     const late = setTimeout(() => away(tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })), SILENT_MS);
     try {
-      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : Number(document.body.dataset.stopS) * 1000 + 10000);      // without a run the answer comes after standstill
+      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, Number(document.body.dataset.stopS) * 1000 + 10000);      // a stop of the drive is answered after standstill
       if (byId("away").textContent.includes(UNDELIVERED)) away("");
-      if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
+      if (found.runs.length && !found.said) location.assign(`/runs/${found.runs[0]}/live`);
       else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired stop")}`}`);
     } catch (error) {
       away(`${tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })}${error instanceof Refused ? `. ${error.message}` : ""}`);
