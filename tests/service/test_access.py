@@ -938,3 +938,13 @@ def test_the_oldest_login_makes_room_for_a_new_one(tmp_path, monkeypatch):
     monkeypatch.setattr(access_module, "_MOST_SESSIONS", 3)
     logins = [access.log_in("anna", PASSWORD, f"192.0.2.{number}")[1].session for number in range(5)]
     assert [one[:16] for one in access._sessions] == logins[2:]
+
+
+def test_the_form_of_a_sign_off_is_shown_to_those_who_may_sign(guarded):
+    request = guarded("POST", "/rigs/a/runs", guarded.sessions["operator"], json={"note": "unseen"})
+    run = request.json()["id"]
+    guarded.service.wait(run, "stop_not_confirmed")
+    for role in ROLES:
+        page = guarded.client.get(f"/runs/{run}", headers=guarded.sessions[role])
+        assert page.status_code == 200
+        assert ('<form id="sign">' in page.text) is (ROLES.index(role) >= ROLES.index("engineer"))
