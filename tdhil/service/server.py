@@ -107,9 +107,14 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
         if not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", name):
             raise UsageError("must be a host's name or address, without a port", where=f"--allowed-host {name[:60]}",
                              entry=MessageCode.SERVICE_OPTION_WRONG)
-    everywhere = host in ("0.0.0.0", "::", "")
-    own = socket.gethostname() if everywhere else host
-    return frozenset(one.lower() for one in ("127.0.0.1", "localhost", "::1", own, *more))
+    return frozenset(one.lower() for one in ("127.0.0.1", "localhost", "::1", _reachable(host), *more))
+
+
+def _reachable(host: str, more: Sequence[str] = ()) -> str:
+    """Return the name of the service in a link. For a ``host`` that means every address: a name of this host."""
+    if host not in ("0.0.0.0", "::", ""):
+        return host
+    return more[0] if more else socket.gethostname()
 
 
 @dataclass(frozen=True)
@@ -184,7 +189,8 @@ def serve(
     publisher = None if broker is None else Publisher(broker, web.broker_messages, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
-    shown = f"[{host}]" if ":" in host else host
+    linked = _reachable(host, names)
+    shown = f"[{linked}]" if ":" in linked else linked
     site = f"{'http' if tls is None else 'https'}://{shown}:{at}"
     say(f"tdhil serve: {site}   (runs: {store.folder})")
     if not _loopback(host):

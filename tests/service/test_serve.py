@@ -23,7 +23,7 @@ from drivers import CommunicationLost
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode, UsageError
 from tdhil.recording import read_run
-from tdhil.service import AccountsFile, attend
+from tdhil.service import AccountsFile, attend, server
 from tdhil.service.client import ServiceError
 from tdhil.service.server import require_way
 from tdhil.service.store import Store
@@ -341,3 +341,11 @@ def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, cap
 def test_a_client_says_what_the_service_says():
     with pytest.raises(CommunicationLost, match="Is tdhil serve running"):
         tdhil.Client("http://127.0.0.1:1").rigs()
+
+
+@pytest.mark.parametrize(("host", "names", "linked"), [
+    ("127.0.0.1", (), "127.0.0.1"), ("0.0.0.0", ("bench.example.com",), "bench.example.com"),
+    ("0.0.0.0", (), socket.gethostname()), ("::", (), socket.gethostname()), ("192.0.2.1", ("other",), "192.0.2.1"),
+])
+def test_a_link_names_a_host_that_can_be_reached(host, names, linked):
+    assert server._reachable(host, names) == linked
