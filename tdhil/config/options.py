@@ -79,8 +79,9 @@ _LIMITS: Final = {"gt": ("greater than", gt), "ge": ("at least", ge), "lt": ("le
 
 @dataclass(frozen=True)
 class Form:
-    """Field of the service's forms. ``parts``: its places among ``run``, ``simulated``, ``real``, ``rehearsal``,
-    ``replay``, ``upload``, ``trace``, ``motion``, ``motion-file`` and ``evidence``.
+    """Field of the service's forms. ``parts``: its places among ``run``, ``acquire`` (details of stage 5 and of its
+    evaluation), ``simulated``, ``real``, ``rehearsal``, ``replay``, ``upload``, ``trace``, ``motion``, ``motion-file``
+    and ``evidence``.
 
     ``unit``: unit of a number that is entered without one. ``hint``: shown in the empty field instead of the default.
     ``ticks``: the field has a tick for each (name, label); its value is the ticked names, separated by commas.
@@ -245,6 +246,7 @@ class RunOptions:
     )
     rate_hz: float | None = option(
         "--rate", "rate_hz", group=Topic.CYCLE, unit=FREQUENCY, metavar="HZ", api=True, gt=0, le=2000,
+        form=Form("Control cycles per second", ("acquire",)),
         unset="what this computer sustains", help="cycles per second (default: {default}, up to the profile's)",
         more="cycles per second, up to 2000. Without it, tdhil tries the profile's rate (250 as a rule) and lower ones "
              "before motion. It takes the highest rate at which 999 of 1000 cycles begin, and are answered, at most "
@@ -257,28 +259,31 @@ class RunOptions:
     )
     mode: Literal["torque", "speed"] | None = option(
         "--mode", "run.mode", group=Topic.MOTION, api=True, unset="torque, if the drive has a torque mode",
-        help="quantity that the drive controls in stage 5",
+        form=Form("Controlled quantity", ("acquire",)), help="quantity that the drive controls in stage 5",
     )
     frequency_hz: float | None = option(
         "--frequency", "run.frequency_hz", group=Topic.MOTION, unit=FREQUENCY, metavar="HZ", api=True, unset="planned",
+        form=Form("Lowest excited frequency, Hz", ("acquire",)),
         ge=1e-6, le=1e4, help="lowest excited frequency, or the tone", more="the lowest excited frequency, or the tone",
     )
     amplitude_rad_s: float | None = option(
         "--amplitude", "run.amplitude_rad_s", group=Topic.MOTION, common=True, unit=SPEED, metavar="RAD_S", api=True,
-        unset="planned", ge=1e-9, le=1e5, help="peak of the speed, such as 1.5 or 15rpm", more="amplitude of the speed",
+        unset="planned", form=Form("Amplitude of the speed", ("acquire",)), ge=1e-9, le=1e5,
+        help="peak of the speed, such as 1.5 or 15rpm", more="amplitude of the speed",
     )
     offset_rad_s: float | None = option(
         "--offset", "run.offset_rad_s", group=Topic.MOTION, common=True, unit=SPEED, metavar="RAD_S", api=True,
-        unset="planned",
+        unset="planned", form=Form("Mean speed", ("acquire",)),
         ge=-1e5, le=1e5, help="mean speed, such as 4 or 40rpm", more="mean speed",
     )
     periods: int | None = option(
         "--periods", "run.periods", group=Topic.MOTION, metavar="N", api=True, unset="planned", ge=1, le=10_000,
-        help="periods per mean speed, settling included",
+        form=Form("Periods at each mean speed", ("acquire",)), help="periods per mean speed, settling included",
         more="periods at each mean speed; the first one is for settling",
     )
     realisations: int = option(
         "--realisations", "run.realisations", 1, group=Topic.MOTION, metavar="N", api=True, ge=1, le=8,
+        form=Form("Sets of phases of the multisine", ("acquire",)),
         help="sets of phases of the multisine at each mean speed (1); 2 or more measure nonlinear distortion",
         more="sets of phases of the multisine at each mean speed. With 2 or more, the frequency response measures the "
              "[nonlinear distortion](../how-to/read-the-frequency-response.md) of the excited lines themselves; each "
@@ -314,11 +319,13 @@ class RunOptions:
     )
     model: str = option(
         "--model", "run.model", "auto", group=Topic.RESULT, choices=MODELS, api=True, asked_again="model of the shaft",
-        form=Form("Model", ("replay", "upload")), help="model of the shaft (default {default}: the simplest that fits)",
+        form=Form("Model", ("acquire", "replay", "upload")),
+        help="model of the shaft (default {default}: the simplest that fits)",
         more="model of the shaft",
     )
     confidence: float = option(
         "--confidence", "run.confidence", 0.95, group=Topic.RESULT, unit=SHARE, metavar="P", api=True, ge=0.5, lt=1,
+        form=Form("Coverage of the interval, %", ("acquire",), PERCENT),
         asked_again="coverage of the interval", help="coverage of the interval (default {default})",
         more="coverage of the interval",
     )
@@ -374,7 +381,7 @@ class RunOptions:
     simulated_speed_scale: float | None = option(
         "--simulated-speed-scale", "run.simulated_speed_scale", group=Topic.SIMULATED, unit=SHARE,
         metavar="RATIO", api=True,
-        ge=0.1, le=10.0, unset="the plant's",
+        ge=0.1, le=10.0, unset="the plant's", form=Form("Speed scale of the drive", ("simulated",), hint="exact"),
         help="speed in the simulated drive's own unit over true speed, such as 1.01; its position counts true turns",
         more="speed in the embedded drive's own unit over true speed; over `reporting.speed_scale` of the plant. The "
              "position counts true turns",

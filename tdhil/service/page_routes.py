@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,7 +16,8 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from tdhil.config import OPTION, STATED, Option, form_options
+from tdhil.config import OPTION, STATED, Option, Origin, Setting, form_options
+from tdhil.errors import TdhilError
 from tdhil.report import GRAPHS
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
@@ -22,6 +25,7 @@ from tdhil.service.api_page import api_page
 from tdhil.service.languages import Language, language_of, languages
 from tdhil.service.limits import STOP_S
 from tdhil.service.middleware import off
+from tdhil.service.start_request import RigFile, limits_text, number_with_unit
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -46,6 +50,37 @@ def _hint(language: Language, option: Option) -> str:
     return language.word(hint)
 
 
+def _settings(rig: RigFile) -> Mapping[str, Setting]:
+    """Return the settings of a run of this rig without any request; none for an unusable rig."""
+    with suppress(TdhilError):
+        return rig.way()[0].settings
+    return {}
+
+
+def _applies(language: Language, option: Option, settings: Mapping[str, Setting]) -> str | Markup:
+    """Return the text of an empty field of the start form: the value that applies, from the rig's file or built in."""
+    setting = settings.get(option.name)
+    if setting is not None and setting.origin is Origin.RIG_FILE and setting.value is not None and not option.joined:
+        number = isinstance(setting.value, int | float)
+        value = number_with_unit(option, setting.value).replace(".", language.decimal) if number else setting.value
+        return language.text("{value} (rig's file)", value=value)
+    hint = option.form_hint
+    if hint.startswith(AS_RIG):
+        value = language.word(hint.removeprefix(AS_RIG)).replace(".", language.decimal)
+        return language.text("default: {value}", value=value)
+    return language.word(hint)
+
+
+def _about(language: Language, option: Option) -> str:
+    """Return the help of an option with its limits, in a language."""
+    said = language.word(option.help_text)
+    text, values = limits_text(option)
+    if not text:
+        return f"{said[0].upper()}{said[1:]}."
+    values = {name: value.replace(".", language.decimal) for name, value in values.items()}
+    return f"{said[0].upper()}{said[1:]}; {language.text(text, **values)}."
+
+
 class Pages:
     """Templates and routes of the pages, in each language."""
 
@@ -65,6 +100,8 @@ class Pages:
             stated_options=[OPTION[name] for name in STATED],
             language=language, languages=self._languages.values(),
             graphs=GRAPHS, _=language.text, word=language.word, hint=lambda option: _hint(language, option),
+            applies=lambda option, settings: _applies(language, option, settings),
+            about=lambda option: _about(language, option),
             code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
             speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
         found.filters["number"] = language.number
@@ -117,6 +154,9 @@ class Pages:
                 known["run"] = await off(lambda: site.run_view(request.path_params["run"]))
             if "fleet" in request.path_params:
                 known["fleet"] = await off(lambda: site.fleets.get(request.path_params["fleet"]))
+            if template == "start.html":
+                known["settings"] = await off(
+                    lambda: _settings(site.supervisor.rigs.get(request.path_params["rig"])))
             if template in ("rigs.html", "new_rig.html"):
                 known["folder"] = site.supervisor.rigs.folder is not None
                 known["built_in"] = await off(lambda: site.supervisor.rigs.built_in)

@@ -84,6 +84,28 @@ SMALLEST: Final = 1e-5
 """A lower limit below this value only means that the value must be positive. It is not printed."""
 LARGEST: Final = 1e15
 """An upper limit above this value only comes from the number's type. It is not printed."""
+LOWER, UPPER = ("", "above 0", "at least {low}"), ("", "at most {high}", "below {high}")
+LIMIT_TEXTS: Final = tuple(" and ".join(filter(None, (low, high))) for low in LOWER for high in UPPER if low or high)
+"""Every text of `limits_text`, for the catalogues of the pages."""
+
+
+def number_with_unit(option: Option, value: float) -> str:
+    """Return a number in the unit of the form's field, with this unit."""
+    unit = option.form.unit if option.form is not None and option.form.unit is not None else option.unit
+    if unit is None:
+        return f"{value:g}"
+    return f"{unit.of_si(value):.6g}" + ("" if unit.symbol == "1" else f" {unit.symbol}")
+
+
+def limits_text(option: Option) -> tuple[str, dict[str, str]]:
+    """Return one of `LIMIT_TEXTS`, and its values ``low`` and ``high`` in the unit of the form's field; '' if none."""
+    low = option.limits.get("ge", option.limits.get("gt"))
+    high = option.limits.get("le", option.limits.get("lt"))
+    lower = "" if low is None else LOWER[1] if 0.0 <= low < SMALLEST and option.unit is not None else LOWER[2]
+    upper = "" if high is None or high >= LARGEST else UPPER[1] if "le" in option.limits else UPPER[2]
+    values = {name: number_with_unit(option, limit) for name, limit in (("low", low), ("high", high))
+              if limit is not None}
+    return " and ".join(filter(None, (lower, upper))), values
 
 
 def limits_in_words(option: Option | None, value: Any) -> str:
@@ -92,21 +114,8 @@ def limits_in_words(option: Option | None, value: Any) -> str:
         return ""
     if not option.refusal(value):
         return ""
-    unit = option.form.unit if option.form is not None and option.form.unit is not None else option.unit
-
-    def shown(limit: float) -> str:
-        if unit is None:
-            return f"{limit:g}"
-        return f"{unit.of_si(limit):.6g}" + ("" if unit.symbol == "1" else f" {unit.symbol}")
-
-    low = option.limits.get("ge", option.limits.get("gt"))
-    high = option.limits.get("le", option.limits.get("lt"))
-    words = []
-    if low is not None:
-        words.append("above 0" if 0.0 <= low < SMALLEST and unit is not None else f"at least {shown(low)}")
-    if high is not None and high < LARGEST:
-        words.append(f"{'at most' if 'le' in option.limits else 'below'} {shown(high)}")
-    return f"must be {' and '.join(words)}, not {shown(value)}"
+    text, values = limits_text(option)
+    return f"must be {text.format_map(values)}, not {number_with_unit(option, value)}"
 
 
 class ValuesWrong(UsageError):
@@ -149,6 +158,8 @@ def value_of(option: Option, value: Any) -> Any:
     if option.longest is not None and not (isinstance(value, str) and len(value) <= option.longest):
         raise UsageError(f"must be a text of at most {option.longest} characters", where=where,
                          entry=MessageCode.REQUEST_WRONG)
+    if option.kind is int and isinstance(value, str):
+        raise UsageError("must be a whole number", where=where, entry=MessageCode.REQUEST_WRONG)
     if option.kind is bool and not isinstance(value, bool):
         raise UsageError("must be true or false", where=where, entry=MessageCode.REQUEST_WRONG)
     return value

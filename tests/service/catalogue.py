@@ -59,7 +59,7 @@ def of_scripts() -> Iterator[Text]:
 
 def of_errors() -> Iterator[Text]:
     """What happened and what to do, of each error that a module of the service raises; a value is ``{0}``, ``{1}``."""
-    for path in sorted(SERVICE.rglob("*.py")):
+    for path in (*sorted(SERVICE.rglob("*.py")), ROOT / "profiles" / "quantities.py"):
         if path.name in ELSEWHERE:
             continue
         calls = (one for one in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(one, ast.Call))
@@ -70,7 +70,7 @@ def of_errors() -> Iterator[Text]:
                       if isinstance(pair, ast.Tuple) and len(pair.elts) == 2)          # of ValuesWrong
             for node in (*call.args[:1], *fields, *(one.value for one in call.keywords if one.arg == "next_step")):
                 for part in (node.body, node.orelse) if isinstance(node, ast.IfExp) else (node,):
-                    text = _pattern(part)
+                    text = None if "dimension" in ast.unparse(part) else _pattern(part)      # its word is English
                     if text and re.search(r"[a-z]{2,} \S", re.sub(r"\{\d\}", "", text)):
                         yield Text(str(path.relative_to(ROOT)), "message", text)
 
@@ -113,9 +113,11 @@ def vocabulary() -> Iterator[Text]:
     from tdhil.service.new_rig import new_rig_view
     from tdhil.service.page_routes import AS_RIG
     from tdhil.service.run_state import State
+    from tdhil.service.start_request import LIMIT_TEXTS
 
     options = "tdhil/config/options.py"
-    forms = ("run", "simulated", "real", "rehearsal", "replay", "trace", "upload", "motion", "motion-file", "evidence")
+    forms = ("run", "acquire", "simulated", "real", "rehearsal", "replay", "trace", "upload", "motion", "motion-file",
+             "evidence")
     for part in forms:
         for one in form_options(part):
             assert one.form is not None
@@ -123,6 +125,14 @@ def vocabulary() -> Iterator[Text]:
             hint = one.form_hint.removeprefix(AS_RIG)
             if re.search(r"[A-Za-z]{2,}", hint) and hint not in (one.allowed or ()) and "@" not in hint:
                 yield Text(options, "", hint)
+    for one in form_options("acquire"):
+        yield Text(options, "", one.help_text)
+    for text in LIMIT_TEXTS:
+        yield Text("tdhil/service/start_request.py", "", text)
+        holes = [one for one in ("low", "high") if f"{{{one}}}" in text]
+        numbered = {name: f"{{{number}}}" for number, name in enumerate((*holes, "value"))}
+        message = f"must be {text}, not {{value}}".format_map(numbered)
+        yield Text("tdhil/service/start_request.py", "message", message)
     for role in get_args(Role):
         yield Text("tdhil/service/accounts.py", "role", role)
     for state in (*State, "waiting", "delayed"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -16,8 +17,8 @@ import jsonschema
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
-from tdhil.config import STATED
-from tdhil.config.options import OPTIONS
+from tdhil.config import STATED, form_options
+from tdhil.config.options import OPTION, OPTIONS, Form
 from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
 from tdhil.service.run_state import State
@@ -725,10 +726,14 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
     assert service.supervisor.live() == []
 
 
+MOTION = {"mode", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "periods", "realisations", "rate_hz", "model",
+          "confidence"}
+
+
 @pytest.mark.parametrize(("path", "fields"), [
-    ("/start/a", {"tolerance", "max_time_s", "excitation", "expect", *STATED, "seed", "fault", "real_time",
-                  "simulated_torque_scale", "simulated_added_inertia_kg_m2"}),
-    ("/start/real", {"tolerance", "max_time_s", "excitation", "expect", *STATED, "accept_unverified",
+    ("/start/a", {"tolerance", "max_time_s", "excitation", "expect", *STATED, "seed", "fault", "real_time", *MOTION,
+                  "simulated_torque_scale", "simulated_speed_scale", "simulated_added_inertia_kg_m2"}),
+    ("/start/real", {"tolerance", "max_time_s", "excitation", "expect", *STATED, *MOTION, "accept_unverified",
                      "accept_speed_unit", "reset_fault"}),
     ("/rehearse/a", {"stage", "after", "duration", "real_time"}),
     ("/fleets", {"folder", "below", "archived", "tolerance", "model"}),
@@ -739,14 +744,53 @@ def test_a_form_has_the_fields_of_the_table(client, path, fields):
     assert set(re.findall(r'<(?:input|select)[^>]* name="(\w+)"', page.text)) == fields
     for name, choices in (("excitation", EXCITATIONS), ("model", MODELS)):
         if name in fields:
-            select = re.search(rf'<select name="{name}">(.*?)</select>', page.text, re.DOTALL)
+            select = re.search(rf'<select name="{name}"[^>]*>(.*?)</select>', page.text, re.DOTALL)
             assert re.findall(r"<option>([^<]+)</option>", select[1]) == list(choices)
 
 
 def test_the_form_asks_for_minutes_and_per_cent(client):
     page = client.get("/start/a").text
-    assert re.search(r'name="tolerance" placeholder="as rig.yaml, else 5"[^>]*data-unit="%"', page)
+    assert re.search(r'name="tolerance" placeholder="default: 5"[^>]*data-unit="%"', page)
     assert re.search(r'name="max_time_s" placeholder="as the limits allow"[^>]*data-unit="min"', page)
+
+
+def test_an_empty_field_of_the_start_form_shows_the_value_of_the_rig_s_file(client, rigs):
+    (rigs / "a.yaml").write_text("run: {simulate: true, tolerance: 2%, amplitude_rad_s: 15rpm, excitation: sine,"
+                                 " max_time_s: 90}\n")
+    page = client.get("/start/a").text
+    for name, text in (("tolerance", "2 %"), ("amplitude_rad_s", "1.5708 rad/s"), ("max_time_s", "1.5 min")):
+        assert re.search(rf'name="{name}" placeholder="{text} \(rig&#39;s file\)"', page), name
+    assert re.search(r'<select name="excitation"[^>]*><option value="">sine \(rig&#39;s file\)<', page)
+    german = client.get("/start/a", headers={"accept-language": "de"}).text
+    assert 'name="max_time_s" placeholder="1,5 min (Datei der Anlage)"' in german
+
+
+def test_every_option_that_http_accepts_has_a_field_of_the_start_form():
+    without = {"accept_wider_limit": "of one drive, by name", "real_time_priority": "the service decides"}
+    shown = {one.name for part in ("run", "acquire", "simulated", "real") for one in form_options(part)}
+    assert {one.name for one in OPTIONS if one.api is True} - shown == set(without)
+
+
+def test_a_new_row_of_the_table_is_a_field_with_its_name_unit_default_help_and_limits(client, monkeypatch):
+    (like,) = (one for one in OPTIONS if one.name == "frequency_hz")
+    made = dataclasses.replace(like, name="dwell_hz", flag="--dwell", default=2.5, help="pause, or {default}",
+                               form=Form("Dwell, Hz", ("acquire",)), limits={"ge": 0.5, "lt": 7.0})
+    monkeypatch.setattr("tdhil.config.options.OPTIONS", (*OPTIONS, made))
+    page = client.get("/start/a").text
+    (field,) = re.findall(r'<div class="field"><label data-flag="--dwell".*?</div>', page, re.DOTALL)
+    assert re.search(r'<input name="dwell_hz" placeholder="default: 2.5"[^>]*data-unit="Hz"', field)
+    assert '<label data-flag="--dwell" data-label="Dwell, Hz">Dwell, Hz<input' in field
+    assert 'aria-describedby="about-dwell_hz"' in field
+    assert '<small id="about-dwell_hz" class="dim">Pause, or 2.5; at least 0.5 Hz and below 7 Hz.</small>' in field
+
+
+def test_all_wrong_motions_of_a_request_are_refused_at_once(call):
+    asked = {"amplitude_rad_s": "fast", "offset_rad_s": 1e6, "periods": "many", "frequency_hz": 0.0, "confidence": 0.2}
+    refused = call("POST", "/rigs/a/plan", 422, json=asked)
+    assert {one["option"] for one in refused["fields"]} == set(asked)
+    assert {one["label"] for one in refused["fields"]} == {OPTION[name].label for name in asked}
+    said = {one["option"]: one["message"] for one in refused["fields"]}
+    assert said["confidence"] == "must be at least 50 % and below 100 %, not 20 %"
 
 
 RIG_PAGES = ["/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/rigs/a/file"]

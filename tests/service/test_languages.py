@@ -238,7 +238,7 @@ def test_numbers_of_a_script_have_the_sign_of_the_language_and_send_a_point():
 
 def test_each_option_of_a_form_is_named_in_each_language():
     for one in languages().values():
-        for part in ("run", "simulated", "real", "replay", "trace", "upload"):
+        for part in ("run", "acquire", "simulated", "real", "replay", "trace", "upload"):
             for option in form_options(part):
                 assert option.form is not None
                 assert one.tag == "en" or option.form.label in one.texts

@@ -140,7 +140,9 @@
   }
   function speedUnits() {
     const button = byId("speed-unit");
+    const inputs = [...document.querySelectorAll("[data-speed-input]")];
     const label = () => {
+      for (const one of inputs) one.dataset.unit = inRpm ? "rpm" : "rad/s";
       button.textContent = speedUnit();
       button.setAttribute("aria-label", tr("Speeds in {unit}. Change to {other}", { unit: speedUnit(), other: inRpm ? "rad/s" : tr("rpm") }));
       for (const one of document.querySelectorAll("[data-speed-unit]")) one.textContent = speedUnit();
@@ -148,6 +150,10 @@
     };
     label();
     button.addEventListener("click", () => {
+      for (const one of inputs) {                  // a typed speed stays the same speed
+        const typed = point(one.value);
+        if (/^[-+]?(\d+\.?\d*|\.\d+)$/.test(typed)) one.value = local(String(Number((inRpm ? Number(typed) / RPM : Number(typed) * RPM).toPrecision(6))));
+      }
       inRpm = !inRpm;
       try { localStorage.setItem(UNIT_KEY, inRpm ? "rpm" : "rad/s"); } catch (error) { /* then for this page only */ }
       label();
@@ -285,7 +291,10 @@
     return known.length;
   }
   function unmark(form) {
-    form.querySelectorAll("[aria-invalid]").forEach((one) => { one.removeAttribute("aria-invalid"); one.removeAttribute("aria-describedby"); });
+    form.querySelectorAll("[aria-invalid]").forEach((one) => {
+      one.removeAttribute("aria-invalid");
+      if (one.dataset.about) one.setAttribute("aria-describedby", one.dataset.about); else one.removeAttribute("aria-describedby");
+    });
     form.querySelectorAll(".wrong").forEach((one) => one.remove());
   }
   /** Text of an error: the refusal, or that there is no answer. */
@@ -401,7 +410,12 @@
       }
       const mine = flagged.filter((one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`).test(message));
       const text = mine.reduce((said, one) => said.replaceAll(new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`, "g"), `$1“${one.dataset.label}”`), message);
-      mine.map(fieldOf).forEach((one) => { one.setAttribute("aria-invalid", "true"); one.setAttribute("aria-describedby", "said"); });
+      mine.map(fieldOf).forEach((one) => {
+        one.setAttribute("aria-invalid", "true");
+        one.setAttribute("aria-describedby", "said");
+        const closed = one.closest("details");
+        if (closed) closed.open = true;
+      });
       show(byId("said"), el("p", { class: "alarm", role: "alert" }, text));
       if (mine.length) fieldOf(mine[0]).focus();
     }
