@@ -4,21 +4,26 @@
 
     python benchmarks/many_runs.py [--runs 10000]
 
-The runs are files of requests, states and annotations without logs. Printed are the medians of five tries, s: the
-index made from the files, the longest list during that, one entry renewed, the list, and searches that find one run,
-many, and none.
+The runs are done, with request, state, result, row of the trend and annotations, but without logs. Printed are the
+medians of five tries, s: the index made from the files, the longest list during that, one entry renewed, the list, and
+searches that find one run, many, and none. Then a service with these runs is asked over HTTP: the first and the last
+page of the list, the list in another order, searches, filters, and the trend of a rig with the most runs that a trend
+has. The trend is once computed in the worker process and then comes from the memory; both are printed. Each figure is
+also printed as a share of its target.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import random
 import statistics
 import sys
 import tempfile
 import threading
 import time
 import timeit
+import urllib.request
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -26,11 +31,17 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tdhil.fleet import FleetRow
 from tdhil.service.annotations import Annotations
-from tdhil.service.run_state import State, Status, now, way_to
+from tdhil.service.run_state import State, Status, way_to
 from tdhil.service.store import Index, Store, StoredRequest
+from tests.service.chromium.pages import Served
+from tests.service.conftest import Service
 
 TRIES = 5
+RIGS = 10
+LIST_S, SEARCH_S, TREND_S = 0.3, 0.2, 0.5
+"""Targets over HTTP, s: a page of the list, a search or a filter, and a trend."""
 
 
 def seconds(work: Callable[[], Any]) -> float:
@@ -55,19 +66,67 @@ def waits_during(index: Index) -> list[float]:
 
 
 def make(store: Store, runs: int) -> None:
-    """Write the files of ended runs; each tenth has tags and an edited note, each hundredth is archived."""
+    """Write the files of done runs; each tenth has tags and an edited note, each hundredth is archived."""
+    draw = random.Random(7)
     for number in range(runs):
-        run, at = f"20260101-{number // 36 % 240000:06d}-{number:06x}", now()
+        run = f"20260101-{number // 36 % 240000:06d}-{number:06x}"
+        at = f"2026-{1 + number // 28 // 60 % 12:02d}-{1 + number // 60 % 28:02d}T12:{number % 60:02d}:00+00:00"
         (store.runs / run).mkdir()
-        request = StoredRequest(run, f"rig-{number % 20}", "rig.yaml", "0" * 64, {"operator": "Anna", "note": "daily"},
-                                "local", at, True, "never")
-        status = way_to(Status.begun(run, request.rig, at), State.REFUSED, at)
-        for name, plain in (("request.json", asdict(request)), ("state.json", status.plain())):
+        said = {"operator": "Anna", "note": "daily"}
+        request = StoredRequest(run, f"rig-{number % RIGS}", "rig.yaml", "0" * 64, said, "local", at, True, "never")
+        status = way_to(Status.begun(run, request.rig, at), State.PREFLIGHT, at)
+        for state in (State.MOVING, State.IDENTIFYING, State.DONE):
+            status = way_to(status, state, at)
+        value = draw.gauss(104.0, 0.4)
+        row = FleetRow(run, "valid", rig=request.rig, date=at, inertia_kg_m2=value, inertia_low_kg_m2=value - 0.9,
+                       inertia_high_kg_m2=value + 0.9, confidence=0.95, torque_scale_rel_sd=0.02, simulated=True,
+                       drive_name="Inverter", profile="generic/cia402")
+        result = {"verdict": "valid", "inertia_kg_m2": {
+            "value": value, "low": value - 0.9, "high": value + 0.9, "low_total": value - 4.0,
+            "high_total": value + 4.0, "repeatability_rel": 0.0087}}
+        for name, plain in (("request.json", asdict(request)), ("state.json", status.plain()),
+                            ("row.json", asdict(row)), ("result.json", result)):
             (store.runs / run / name).write_text(json.dumps(plain))
         if number % 10 == 0:
             found = Annotations((f"batch {number // 100}", "checked"), note=f"bearing {number}",
                                 archived=number % 100 == 0)
             (store.runs / run / "annotations.json").write_text(json.dumps(found.plain()))
+
+
+def over_http(folder: Path, runs: int) -> None:
+    """Start a service with these runs, and print how long it takes to answer."""
+    rigs = folder / "rigs"
+    rigs.mkdir()
+    for number in range(RIGS):
+        (rigs / f"rig-{number}.yaml").write_text("run: {simulate: true}\n")
+    service = Service(folder, rigs)
+    service.index.rebuild()
+    served = Served(service)
+
+    def answer(path: str) -> bytes:
+        with urllib.request.urlopen(f"{served.url}/api/v1{path}", timeout=60) as found:
+            return bytes(found.read())
+
+    pages = json.loads(answer("/runs/page"))["pages"]
+    for what, target_s, path in (
+        ("first page", LIST_S, "/runs/page"), ("last page", LIST_S, f"/runs/page?page={pages}"),
+        ("last page by J", LIST_S, f"/runs/page?page={pages}&sort=inertia_kg_m2"),
+        ("search, many found", SEARCH_S, "/runs/page?text=anna%20daily"),
+        ("search, one found", SEARCH_S, f"/runs/page?text=bearing%20{runs // 2 + 10}%20checked"),
+        ("search, none found", SEARCH_S, "/runs/page?text=nothing%20of%20the%20kind"),
+        ("rig, verdict and tag", SEARCH_S, "/runs/page?rig=rig-0&verdict=valid&tag=checked"),
+    ):
+        took_s = seconds(lambda path=path: answer(path))
+        print(f"HTTP, {what}: {took_s:.3f} s, {took_s / target_s:.0%} of {target_s} s")
+    for what in ("first, with the start of the worker process", "computed again", "again, from the memory"):
+        if what == "computed again":
+            path = service.store.runs / service.index.find(rig="rig-0", limit=1)[0].id / "row.json"
+            path.write_text(path.read_text().replace('"valid"', '"valid_wide"'))
+        took_s = timeit.timeit(lambda: answer("/rigs/rig-0/trend"), number=1)
+        print(f"HTTP, trend of {min(1000, runs // RIGS)} results, {what}: {took_s:.3f} s, {took_s / TREND_S:.0%} of "
+              f"{TREND_S} s")
+    served.end()
+    service.supervisor.close()
 
 
 def main() -> None:
@@ -96,6 +155,7 @@ def main() -> None:
             ("search, archived too", lambda: index.find(text="batch 0 checked", archived=True)),
         ):
             print(f"{what}: {seconds(work):.4f} s")
+        over_http(Path(folder), runs)
 
 
 if __name__ == "__main__":

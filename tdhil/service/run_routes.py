@@ -17,6 +17,7 @@ from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
 from tdhil.service.middleware import error_view, off, whole_number
 from tdhil.service.routing import api
+from tdhil.service.run_filter import NEWEST, SORTS, Order, RunFilter
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
     AcceptanceView,
@@ -31,6 +32,7 @@ from tdhil.service.schemas import (
     LeaseView,
     ReplayBody,
     ReplayView,
+    RunsPageView,
     RunView,
     SignatureBody,
     SignOffBody,
@@ -49,12 +51,15 @@ if TYPE_CHECKING:
 
 LONGEST_SEARCH: Final = 200
 """Longest text of a search, characters."""
+LAST_PAGE: Final = 100_000
+"""Highest number of a page that is accepted: far more runs than a disk holds."""
 
 
 def routes(site: Site) -> list[Route]:
-    """Return the routes. ``compare`` comes before ``run``, since the path of ``run`` matches it, too."""
+    """Return the routes. ``runs_page`` and ``compare`` come before ``run``, whose path matches theirs, too."""
     return [
         api(site, runs),
+        api(site, runs_page),
         api(site, compare),
         api(site, run),
         api(site, confirm),
@@ -77,14 +82,35 @@ async def runs(site: Site, request: Request, body: None) -> list[Summary]:
     limit = query.get("limit", "100")
     if whole_number(limit, 1, 1000) is None:
         raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
+    wanted = _filter(request)
+    return await off(lambda: site.find_runs(wanted, limit=int(limit)))
+
+
+async def runs_page(site: Site, request: Request, body: None) -> RunsPageView:
+    """Return a page of the list of runs."""
+    query, wanted = request.query_params, _filter(request)
+    page, key, way = query.get("page", "1"), query.get("sort", NEWEST.key), query.get("order", "desc")
+    if not page.isdecimal() or not 1 <= int(page) <= LAST_PAGE:
+        raise UsageError(f"must be 1 to {LAST_PAGE}", where="page", entry=MessageCode.REQUEST_WRONG)
+    if key not in SORTS or way not in ("asc", "desc"):
+        raise UsageError("names no order of a list", where="sort" if key not in SORTS else "order",
+                         next_step=f"Give sort={', '.join(SORTS)} and order=asc or desc",
+                         entry=MessageCode.REQUEST_WRONG)
+    return await off(lambda: site.runs_page(wanted, Order(key, way == "desc"), int(page)))
+
+
+def _filter(request: Request) -> RunFilter:
+    """Return the conditions on the runs of a list. Raises UsageError."""
+    query = request.query_params
     if (state := query.get("state")) is not None and state not in set(State):
         raise UsageError(f"{state[:40]!r} is not a state", where="state",
                          next_step=f"States: {', '.join(State)}", entry=MessageCode.REQUEST_WRONG)
-    text = query.get("text", "")
-    if len(text) > LONGEST_SEARCH:
-        raise UsageError(f"must be at most {LONGEST_SEARCH} characters", where="text", entry=MessageCode.REQUEST_WRONG)
-    archived = archived_too(request)
-    return await off(lambda: site.list_runs(query.get("rig"), state, int(limit), text, archived=archived))
+    for name in ("text", "rig", "verdict", "tag", "until"):
+        if len(query.get(name, "")) > LONGEST_SEARCH:
+            raise UsageError(f"must be at most {LONGEST_SEARCH} characters", where=name,
+                             entry=MessageCode.REQUEST_WRONG)
+    return RunFilter(query.get("rig"), state, query.get("verdict"), query.get("tag"), query.get("text", ""),
+                     archived_too(request), query.get("until"))
 
 
 def archived_too(request: Request) -> bool:

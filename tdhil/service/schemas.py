@@ -20,6 +20,7 @@ from tdhil.service.audit import Broken, Entry
 from tdhil.service.evidence_request import STATEMENT, EvidenceView
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
+from tdhil.service.run_filter import SORTS
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.start_request import TAKEN, option_schema
 from tdhil.service.store import Summary
@@ -258,6 +259,24 @@ class TrendView:
 
     rig: str
     trend: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RunsPageView:
+    """A page of the list of runs. ``total``: number of runs that meet the conditions; ``first``: number of the first
+    run on this page, 0 for an empty page. ``until``: id for the next request, so that new runs move no page. ``rigs``,
+    ``verdicts``, ``tags``: the values that occur, for a choice.
+    """
+
+    runs: list[Summary]
+    total: int
+    page: int
+    pages: int
+    first: int
+    until: str | None
+    rigs: list[str]
+    verdicts: list[str]
+    tags: list[str]
 
 
 @dataclass(frozen=True)
@@ -657,6 +676,13 @@ class Route:
 
 
 _ARCHIVED: Final = {"archived": "true: archived runs too"}
+_RUN_FILTER: Final = {
+    "rig": "runs of this rig only", "state": "runs in this state only", "verdict": "runs with this verdict only",
+    "tag": "runs with this tag only",
+    "text": "runs with these words in id, rig, state, time, user, verdict, operator, note,"
+    " customer, order number, place or tags",
+    "until": "runs up to this id only", **_ARCHIVED,
+}
 _RANGE: Final = {"Range": "a part of it, such as bytes=0-99"}
 
 
@@ -692,10 +718,11 @@ ROUTES: Final = (
     Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without a run, tdhil stop on its drive, which"
           " needs an operator if no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]}, errors=(422,),
-          query={"rig": "runs of this rig only", "state": "runs in this state only",
-                 "text": "runs with these words in id, rig, state, time, user, verdict, operator, note,"
-                 " customer, order number, place or tags",
-                 "limit": "most runs to return (100)", **_ARCHIVED}),
+          query={**_RUN_FILTER, "limit": "most runs to return (100)"}),
+    Route("GET", "/runs/page", "runs_page", "A page of the list of runs, and what can be chosen in it", "viewer",
+          {200: RunsPageView}, errors=(422,),
+          query={**_RUN_FILTER, "sort": f"{', '.join(SORTS)} (id)", "order": "desc or asc (desc)",
+                 "page": "number of the page (1)"}),
     Route("GET", "/runs/compare", "compare", "Compare runs", "viewer", {200: CompareView}, errors=(404, 422),
           query={"runs": "two to eight runs, separated by commas", **_ARCHIVED}),
     Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),

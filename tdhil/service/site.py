@@ -31,8 +31,9 @@ from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
 from tdhil.service.run_channel import lives
+from tdhil.service.run_filter import NEWEST, Order, RunFilter
 from tdhil.service.run_state import NotThere, Status
-from tdhil.service.schemas import ReplayView, RigView, RunView, adapter
+from tdhil.service.schemas import ReplayView, RigView, RunsPageView, RunView, adapter
 from tdhil.service.start_request import RigFile
 from tdhil.service.store import Summary, read_json
 from tdhil.service.supervisor import Supervisor
@@ -50,6 +51,8 @@ NO_RIG: Final = "Uploaded recording"
 """Title of a run without a rig."""
 WHOLE_INDEX_S: Final = 30.0
 """Longest wait of a trend for an index that is being made, s: 10,000 runs take about 10 s. A list does not wait."""
+PAGE_RUNS: Final = 100
+"""Number of runs on a page of the list."""
 TREND_RUNS: Final = 1000
 """Number of latest runs in a trend."""
 
@@ -198,21 +201,47 @@ class Site:
 
         Archived runs are included only with ``archived``.
         """
-        live = self.supervisor.ahead_of_the_index()
-        now_live = []
-        for run in live:
-            with suppress(NotThere):
-                now_live.append(self.store.summary(run))
+        return self.find_runs(RunFilter(rig, state, text=text, archived=archived), limit=limit)
+
+    def find_runs(
+        self, wanted: RunFilter, order: Order = NEWEST, *, limit: int = 100, offset: int = 0,
+    ) -> list[Summary]:
+        """Return a part of the runs that meet the conditions, as `list_runs`."""
+        live = self._ahead_of_the_index()
+        ahead = [one for one in live.values() if wanted.contains(one)]
+        first = max(0, offset - len(ahead))        # rows of live runs move a row of the index by their number at most
         try:
-            indexed = self.supervisor.index.find(rig=rig, state=state, text=text, limit=limit + len(live),
-                                                 archived=archived)
-            ended = [one for one in indexed if one.id not in live]
+            ended = self.supervisor.index.find(
+                wanted, order=order, limit=limit + offset - first, offset=first, without=live)
         except (sqlite3.Error, OSError):
-            ended = [one for one in self.store.summaries() if one.id not in live]
-        found = [one for one in (*now_live, *ended)
-                 if rig in (None, one.rig) and state in (None, one.state) and one.contains(text)
-                 and (archived or not one.archived)]
-        return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
+            first, ended = 0, [one for one in self.store.summaries() if one.id not in live and wanted.contains(one)]
+        return order.sorted((*ahead, *ended))[offset - first : offset - first + limit]
+
+    def runs_page(self, wanted: RunFilter, order: Order, page: int) -> RunsPageView:
+        """Return a page of the list of runs, with the number of all that meet the conditions, and the choices."""
+        live = self._ahead_of_the_index()
+        ahead = [one for one in live.values() if wanted.contains(one)]
+        index = self.supervisor.index
+        try:
+            total = index.count(wanted, live) + len(ahead)
+            choices = index.choices()
+        except (sqlite3.Error, OSError):
+            total = len(ahead) + sum(wanted.contains(one) for one in self.store.summaries() if one.id not in live)
+            choices = {"rig": set(), "verdict": set(), "tags": set()}
+        found = self.find_runs(wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS)
+        newest = wanted.until or next((one.id for one in self.find_runs(RunFilter(archived=True), limit=1)), None)
+        rigs = choices["rig"] | {one.rig for one in live.values() if one.rig}
+        return RunsPageView(
+            found, total, page, max(1, -(-total // PAGE_RUNS)), (page - 1) * PAGE_RUNS + 1 if found else 0, newest,
+            sorted(rigs), sorted(choices["verdict"]), sorted(choices["tags"], key=str.casefold))
+
+    def _ahead_of_the_index(self) -> dict[str, Summary]:
+        """Return the rows of the runs whose index entry is missing or out of date, from the files."""
+        found = {}
+        for run in self.supervisor.ahead_of_the_index():
+            with suppress(NotThere):
+                found[run] = self.store.summary(run)
+        return found
 
     def trend_rows(self, rig: str, *, archived: bool = False) -> list[dict[str, Any]]:
         """Return the rows of a rig's history, each with the time of the run's request, as on every page.

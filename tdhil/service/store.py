@@ -17,7 +17,7 @@ import secrets
 import shutil
 import sqlite3
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -28,6 +28,7 @@ from tdhil.config import STATED
 from tdhil.errors import LogUnopened
 from tdhil.fleet import ANNOTATIONS_FILE
 from tdhil.service.annotations import Annotations
+from tdhil.service.run_filter import NEWEST, SEARCHED_COLUMN, Order, RunFilter
 from tdhil.service.run_state import NotThere, State, Status, now
 
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
@@ -192,7 +193,7 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
 
 def _plain_row(summary: Summary) -> dict[str, Any]:
     """Return the row as values of the index: its tags are one text, and so is all that a search looks in."""
-    return {**summary.__dict__, "tags": ", ".join(summary.tags), _SEARCHED: summary.searched}
+    return {**summary.__dict__, "tags": ", ".join(summary.tags), SEARCHED_COLUMN: summary.searched}
 
 
 def _summary_of_row(plain: Mapping[str, Any]) -> Summary:
@@ -377,8 +378,6 @@ class Store:
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
-_SEARCHED: Final = "searched"
-"""Column with the text of a row in lower case, so that a search calls no function for each row."""
 _VERSION: Final = 6
 BATCH: Final = 100
 """Runs that are written to the index under its lock at a time: 5 to 20 ms, after their files were read without it."""
@@ -411,27 +410,37 @@ class Index:
             base.execute("delete from runs where id = ?", (run,))
 
     def find(
-        self, *, rig: str | None = None, state: str | None = None, text: str = "", limit: int = 100,
-        archived: bool = False,
+        self, wanted: RunFilter | None = None, *, order: Order = NEWEST, limit: int = 100, offset: int = 0,
+        without: Collection[str] = (), **conditions: Any,
     ) -> list[Summary]:
-        """Return matching rows, the newest first; archived runs only with ``archived``. Raises sqlite3.Error.
+        """Return matching rows, the newest first. Raises sqlite3.Error.
 
-        ``text``: words for `Summary.contains`. During `rebuild`, the rows are those of the former index, or without
-        one the newest so far.
+        ``conditions``: those of `RunFilter`, in place of ``wanted``. ``without``: ids of runs that are left out. During
+        `rebuild`, the rows are those of the former index, or without one the newest so far.
         """
         self._ensure()
-        where = [] if archived else ["not archived"]
-        where += [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
-        values = [value for value in (rig, state) if value is not None]
-        for word in text.split():
-            where.append(f"instr({_SEARCHED}, ?)")
-            values.append(word.casefold())
-        clause = f"where {' and '.join(where)}" if where else ""
+        clause, values = (wanted or RunFilter(**conditions)).sql(without)
         with self._lock, closing(self._open()) as base:
             rows = base.execute(
-                f"select {', '.join(_COLUMNS)} from runs {clause} order by id desc limit ?", (*values, limit)
+                f"select {', '.join(_COLUMNS)} from runs {clause} {order.sql} limit ? offset ?",
+                (*values, limit, offset),
             ).fetchall()
         return [_summary_of_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+
+    def count(self, wanted: RunFilter, without: Collection[str] = ()) -> int:
+        """Return the number of matching rows. Raises sqlite3.Error."""
+        self._ensure()
+        clause, values = wanted.sql(without)
+        with self._lock, closing(self._open()) as base:
+            return int(base.execute(f"select count(*) from runs {clause}", values).fetchone()[0])
+
+    def choices(self) -> dict[str, set[str]]:
+        """Return the values of ``rig``, ``verdict`` and ``tags`` in the rows of all runs. Raises sqlite3.Error."""
+        self._ensure()
+        with self._lock, closing(self._open()) as base:
+            found = {name: {str(value) for (value,) in base.execute(f"select distinct {name} from runs") if value}
+                     for name in ("rig", "verdict", "tags")}
+        return {**found, "tags": {tag for text in found["tags"] for tag in text.split(", ")}}
 
     def wait_until_made(self, within_s: float) -> bool:
         """Wait for a rebuild in progress. Return whether the index has every run."""
@@ -509,7 +518,8 @@ class Index:
             if self._made_anew:
                 with base:
                     base.execute("drop table if exists runs")
-                    base.execute(f"create table runs (id text primary key, {', '.join((*_COLUMNS[1:], _SEARCHED))})")
+                    columns = ", ".join((*_COLUMNS[1:], SEARCHED_COLUMN))
+                    base.execute(f"create table runs (id text primary key, {columns})")
                     base.execute("create index by_rig on runs (rig, id)")
                     base.execute(f"pragma user_version = {_VERSION}")
             found = self._path.stat()

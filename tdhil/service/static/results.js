@@ -283,51 +283,98 @@
   // -- lists
 
   const NO_RIG = tr("Uploaded recording");         // as the title of its page
+  const TURNED = ["sort", "order", "page", "until"];        // what an address of the list has beside its fields
   function runsPage() {
-    const chosen = new Set(), link = byId("compare");
+    const chosen = new Set(), link = byId("compare"), none = byId("none"), form = byId("search"), turn = byId("turn");
+    const heads = [...document.querySelectorAll("[data-key]")], named = [...form.elements].filter((one) => one.name);
+    let query = new URLSearchParams(), found = null, shown = "", asking = 0;
     link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}${form.elements.archived.checked ? "&archived=true" : ""}`));
-    let shown = "";
-    function choose(id, yes) {
-      if (yes) chosen.add(id); else chosen.delete(id);
+    function said() {
       const enough = chosen.size >= 2 && chosen.size <= 8;
       link.disabled = !enough;
+      none.hidden = !chosen.size;
       byId("chosen").textContent = chosen.size ? chosen.size > 8 ? tr("{count} chosen, eight at most", { count: chosen.size }) : tr("{count} chosen", { count: chosen.size }) : tr("Choose two to eight runs.");
     }
-    const form = byId("search"), heads = [...document.querySelectorAll("[data-key]")];
-    let found = [], key = "id", down = true, asking = 0;
+    none.addEventListener("click", () => { chosen.clear(); said(); draw(); });
     form.elements.state.append(...Object.entries(STATES).map(([state, text]) => el("option", { value: state }, text)));
+
+    /** Fill a choice with the values that occur. The chosen one stays, also if it occurs no more. */
+    function offer(select, values, text = (one) => one) {
+      const now = query.get(select.name) || "", all = [...new Set([...values, ...(now ? [now] : [])])];
+      if (JSON.stringify(all) !== select.dataset.offered) show(select, select.options[0], ...all.map((one) => el("option", { value: one }, text(one))));
+      select.dataset.offered = JSON.stringify(all);
+      select.value = now;
+    }
+    const choices = (rigs, verdicts, found) => {
+      offer(form.elements.rig, rigs);
+      offer(form.elements.verdict, verdicts, (one) => word(one, "verdict"));
+      offer(form.elements.tag, found);
+    };
+    /** Show the list of an address: its fields, its order, its page. */
+    function fromAddress() {
+      query = new URLSearchParams(location.search);
+      for (const one of named) if (one.type === "checkbox") one.checked = query.get(one.name) === "true"; else if (one.name === "text" || one.name === "state") one.value = query.get(one.name) || "";
+      choices(found ? found.rigs : [], found ? found.verdicts : [], found ? found.tags : []);
+    }
+    /** The address of this list with other values; without a value for null. */
+    function addressOf(changes) {
+      const next = new URLSearchParams(query);
+      for (const [name, value] of Object.entries(changes)) if (value) next.set(name, value); else next.delete(name);
+      return `${location.pathname}${next.size ? `?${next}` : ""}`;
+    }
+    function present(address, push) {
+      history[push ? "pushState" : "replaceState"](null, "", address);
+      query = new URLSearchParams(location.search);
+      again();
+    }
     function draw() {
-      const said = (one) => [one.operator, one.note].filter(Boolean).join(": ") || null, value = (one) => (key === "note" ? said(one) : one[key]);
-      const order = (a, b) => (a === null) - (b === null) || (typeof a === "number" ? a - b : String(a).localeCompare(String(b)));
-      const runs = [...found].sort((a, b) => (value(a) === null || value(b) === null ? order(value(a), value(b)) : (down ? -1 : 1) * order(value(a), value(b))) || (a.id < b.id ? 1 : -1));
-      show(byId("runs"), ...(runs.length ? runs.map((one) => {
-        const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: `${one.rig || NO_RIG}, ${when(one.asked)}` }), checked: chosen.has(one.id), disabled: one.verdict === null });
-        box.addEventListener("change", () => choose(one.id, box.checked));
+      const people = (one) => [one.operator, one.note].filter(Boolean).join(": ");
+      const filtered = [...query.keys()].some((one) => !TURNED.includes(one) && one !== "archived");
+      show(byId("runs"), ...(found.runs.length ? found.runs.map((one) => {
+        const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: `${one.rig || NO_RIG}, ${when(one.asked)}` }), disabled: one.verdict === null });
+        box.checked = chosen.has(one.id);
+        box.addEventListener("change", () => { if (box.checked) chosen.add(one.id); else chosen.delete(one.id); said(); });
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig || NO_RIG}, ${when(one.asked)}` }, one.rig || NO_RIG), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
           el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict ? word(one.verdict, "verdict") : ""),
-          el("td", {}, said(one) || "", ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, tr("ARCHIVED"))] : [])));
-      }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, form.elements.text.value || form.elements.state.value ? tr("no run matches") : tr("no run yet")))]));
+          el("td", {}, people(one), ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, tr("ARCHIVED"))] : [])));
+      }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, found.total ? tr("no run on this page") : filtered ? tr("no run matches") : tr("no run yet")))]));
+      const last = found.first + found.runs.length - 1;
+      byId("position").textContent = found.runs.length ? found.total === 1 ? tr("1 run") : tr("Runs {first} to {last} of {total}", { first: found.first, last, total: found.total }) : "";
+      turn.hidden = found.pages === 1 && found.page === 1;
+      turn.querySelector("span").textContent = tr("Page {page} of {pages}", { page: found.page, pages: found.pages });
+      for (const [rel, page] of [["prev", Math.min(found.page - 1, found.pages)], ["next", found.page + 1]]) {
+        const one = turn.querySelector(`[rel=${rel}]`), there = page >= 1 && page <= found.pages;
+        if (there) one.href = addressOf(page === 1 ? { page: null, until: null } : { page, until: found.until }); else one.removeAttribute("href");
+        one.setAttribute("aria-disabled", String(!there));
+      }
+      const key = query.get("sort") || "id", way = (query.get("order") || "desc") === "desc" ? "descending" : "ascending";
+      for (const one of heads) if (one.dataset.key === key) one.parentElement.setAttribute("aria-sort", way); else one.parentElement.removeAttribute("aria-sort");
     }
     async function look() {
-      const query = new URLSearchParams(), mine = ++asking;
-      for (const name of ["text", "state"]) if (form.elements[name].value.trim()) query.set(name, form.elements[name].value.trim());
-      if (form.elements.archived.checked) query.set("archived", "true");
-      const runs = await call("GET", `/runs?${query}`), now = JSON.stringify(runs);
+      const mine = ++asking, next = await call("GET", `/runs/page?${query}`), now = JSON.stringify(next) + query;
       if (mine !== asking || now === shown) return;          // a later request is on its way; or keep the keyboard focus
       shown = now;
-      found = runs;
+      found = next;
+      choices(found.rigs, found.verdicts, found.tags);
       draw();
     }
     const again = () => look().catch((error) => { if (error instanceof Refused) away(error.message); });
-    form.addEventListener("input", again);
+    form.addEventListener("input", () => present(addressOf({ ...Object.fromEntries(named.map((one) => [one.name, one.type === "checkbox" ? one.checked && "true" : one.value.trim()])), page: null, until: null }), false));
     form.addEventListener("submit", (event) => { event.preventDefault(); again(); });
     for (const one of heads) one.addEventListener("click", () => {
-      down = one.dataset.key === key ? !down : one.dataset.key === "id";
-      key = one.dataset.key;
-      heads.forEach((head) => { if (head === one) head.parentElement.setAttribute("aria-sort", down ? "descending" : "ascending"); else head.parentElement.removeAttribute("aria-sort"); });
-      draw();
+      const { key } = one.dataset, down = key === (query.get("sort") || "id") ? query.get("order") === "asc" : key === "id";
+      present(addressOf({ sort: key === "id" ? null : key, order: key === "id" && down ? null : down ? "desc" : "asc", page: null, until: null }), false);
     });
+    turn.addEventListener("click", (event) => {
+      const to = event.target.closest("a[href]");
+      if (!to || event.ctrlKey || event.metaKey || event.shiftKey) return;
+      event.preventDefault();
+      present(to.href, true);                        // the choice of runs to compare stays
+      scrollTo(0, 0);
+    });
+    addEventListener("popstate", () => { fromAddress(); again(); });
+    fromAddress();
     every(3000, look);
   }
 

@@ -187,6 +187,7 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
     page.get_by_text("Carla: done").wait_for()
     assert set(names.all_inner_texts()) == {"Carla: done", "Berta: done", "Anna: done"}
     page.get_by_role("button", name="operator, note, tags").click()
+    page.locator("#runs tr").first.get_by_text("Anna: done").wait_for()
     assert names.all_inner_texts() == ["Anna: done", "Berta: done", "Carla: done"]
     page.get_by_role("button", name="when").click()
     search.fill("anna done")

@@ -1,0 +1,95 @@
+"""Which runs a list shows, and in which order. The index and the rows of live runs follow the same rules."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from tdhil.service.store import Summary
+
+SEARCHED_COLUMN: Final = "searched"
+"""Column of the index with the text of a row in lower case, so that a search calls no function for each row."""
+SORTS: Final = {
+    "id": ("id",), "rig": ("rig",), "state": ("state",), "inertia_kg_m2": ("inertia_kg_m2",), "verdict": ("verdict",),
+    "note": ("operator", "note"),
+}
+"""Keys by which a list can be sorted, with their columns."""
+
+
+@dataclass(frozen=True)
+class RunFilter:
+    """Conditions on the runs of a list. None: any. ``archived``: archived runs, too.
+
+    ``tag``: one whole tag. ``text``: words for `Summary.contains`. ``until``: no run with a later id, so that a page of
+    a list has the same runs when new ones come.
+    """
+
+    rig: str | None = None
+    state: str | None = None
+    verdict: str | None = None
+    tag: str | None = None
+    text: str = ""
+    archived: bool = False
+    until: str | None = None
+
+    def contains(self, one: Summary) -> bool:
+        """Return whether a row meets the conditions."""
+        return (
+            self.rig in (None, one.rig) and self.state in (None, one.state) and self.verdict in (None, one.verdict)
+            and (self.tag is None or self.tag in one.tags) and one.contains(self.text)
+            and (self.archived or not one.archived) and (self.until is None or one.id <= self.until)
+        )
+
+    def sql(self, without: Iterable[str] = ()) -> tuple[str, list[str]]:
+        """Return the conditions as SQL, with its values. ``without``: ids of runs that are left out."""
+        where = [] if self.archived else ["not archived"]
+        values: list[str] = []
+        for text, value in (
+            ("rig = ?", self.rig), ("state = ?", self.state), ("verdict = ?", self.verdict),
+            ("instr(', ' || tags || ', ', ', ' || ? || ', ')", self.tag), ("id <= ?", self.until),
+            *((f"instr({SEARCHED_COLUMN}, ?)", word.casefold()) for word in self.text.split()),
+            *(("id <> ?", one) for one in without),
+        ):
+            if value is not None:
+                where.append(text)
+                values.append(value)
+        return f"where {' and '.join(where)}" if where else "", values
+
+
+@dataclass(frozen=True)
+class Order:
+    """Order of a list: a key of `SORTS`, and whether the largest value comes first.
+
+    Rows without a value come last. Rows with the same value follow each other from the newest to the oldest.
+    """
+
+    key: str = "id"
+    down: bool = True
+
+    @property
+    def sql(self) -> str:
+        """Return the order as SQL. Texts are compared without regard to upper and lower case of a to z."""
+        way = "desc" if self.down else "asc"
+        if self.key == "id":
+            return f"order by id {way}"
+        parts = (f"{name} is null, {name} collate nocase {way}" for name in SORTS[self.key])
+        return f"order by {', '.join(parts)}, id desc"
+
+    def sorted(self, rows: Iterable[Summary]) -> list[Summary]:
+        """Return rows in this order, as the index does."""
+        if self.key == "id":
+            return sorted(rows, key=lambda one: one.id, reverse=self.down)
+        found = sorted(rows, key=lambda one: one.id, reverse=True)
+        for name in reversed(SORTS[self.key]):
+            found.sort(key=lambda one: self._place(getattr(one, name)), reverse=self.down)
+        return found
+
+    def _place(self, value: Any) -> tuple[bool, Any]:
+        missing = value is None
+        folded = value.encode().lower() if isinstance(value, str) else value
+        return (not missing if self.down else missing, 0 if missing else folded)
+
+
+NEWEST: Final = Order()

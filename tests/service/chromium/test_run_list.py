@@ -1,0 +1,92 @@
+"""The pages of the list of runs in Chromium: filters, order and page stand in the address, and a choice stays."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.service.chromium.pages import IN_CHROMIUM
+from tests.service.test_run_list import rows
+
+pytestmark = IN_CHROMIUM
+RUNS = 250
+
+
+@pytest.fixture
+def many(served: Any) -> Any:
+    """Rows of runs in the index: 250, of which the newest are numbered the highest."""
+    index = served.service.index
+    index.rebuild()
+    for one in rows(RUNS):
+        index.put(replace(one, archived=False))
+    return served
+
+
+def shown(page: Any) -> list[int]:
+    return [int(one) for one in re.findall(r"run (\d+)", page.locator("#runs").inner_text())]
+
+
+def test_the_pages_of_the_list_are_turned_and_their_addresses_kept(page, many):
+    page.goto("/runs")
+    page.get_by_text("Runs 1 to 100 of 250").wait_for()
+    assert shown(page) == list(range(249, 149, -1))
+    assert page.get_by_text("Previous page").get_attribute("aria-disabled") == "true"
+    page.locator("#runs input:enabled").first.check()
+    page.get_by_role("link", name="Next page").focus()
+    page.keyboard.press("Enter")
+    page.get_by_text("Runs 101 to 200 of 250").wait_for()
+    assert shown(page) == list(range(149, 49, -1))
+    page.locator("#runs input:enabled").first.check()
+    page.get_by_text("2 chosen").wait_for()                    # of two pages
+    page.get_by_role("link", name="Next page").click()
+    page.get_by_text("Runs 201 to 250 of 250").wait_for()
+    assert page.get_by_text("Next page").get_attribute("aria-disabled") == "true"
+    kept = page.url
+    page.go_back()
+    page.get_by_text("Page 2 of 3").wait_for()
+    assert page.get_by_role("button", name="Compare", exact=True).is_enabled()
+    many.service.index.put(replace(rows(1)[0], id="20260102-000000-000000", note="run 999", archived=False))
+    page.goto(kept)
+    page.get_by_text("Runs 201 to 250 of 250").wait_for()      # a new run moved nothing
+    assert shown(page) == list(range(49, -1, -1))
+    page.get_by_role("link", name="Previous page").click()
+    page.get_by_role("link", name="Previous page").click()
+    page.get_by_text("Runs 1 to 100 of 251").wait_for()
+    assert shown(page)[0] == 999
+
+
+def test_search_filters_and_order_reach_runs_of_every_page(page, many):
+    page.goto("/runs")
+    page.get_by_label("Search").fill("run 7")
+    page.get_by_text(re.compile(r"^Runs 1 to \d+ of \d+$")).wait_for()
+    page.locator("#runs").get_by_text(re.compile(r"run 7\b")).wait_for()          # the oldest page has it
+    page.get_by_label("Search").fill("")
+    page.get_by_text("Runs 1 to 100 of 250").wait_for()
+    page.get_by_label("Rig").select_option("b")
+    page.get_by_label("Verdict").select_option("valid")
+    page.get_by_label("Tag").select_option("bearing")
+    expected = [one for one in rows(RUNS) if one.rig == "b" and one.verdict == "valid" and "bearing" in one.tags]
+    page.get_by_text(f"Runs 1 to {len(expected)} of {len(expected)}").wait_for()
+    page.get_by_role("button", name="J, interval to quote").click()
+    page.locator("th[aria-sort=ascending]").wait_for()
+    known = sorted(one.inertia_kg_m2 for one in expected if one.inertia_kg_m2 is not None)
+    values = [float(one) for one in re.findall(r"([\d.]+) kg", page.locator("#runs").inner_text())]
+    assert values == known and len(known) > 2
+    address = page.url
+    page.goto("/")
+    page.goto(address)                                          # the address has all of it
+    page.get_by_text(f"Runs 1 to {len(expected)} of {len(expected)}").wait_for()
+    assert page.get_by_label("Rig").input_value() == "b" and page.get_by_label("Tag").input_value() == "bearing"
+    page.locator("th[aria-sort=ascending]").wait_for()
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_list_with_its_filters_fits(page, many, width):
+    page.set_viewport_size({"width": width, "height": 844})
+    page.goto("/runs?page=2")
+    page.get_by_text("Page 2 of 3").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
