@@ -119,15 +119,27 @@ async def trend(site: Site, request: Request, body: None) -> TrendView:
 
     archived = archived_too(request)
     found = await off(lambda: site.trend_rows(which.id, archived=archived))
+    notes = await off(lambda: _left_out(site, which.id, archived=archived))
     if not found:
-        nothing = {"rig": which.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
-        return TrendView(which.id, nothing)
+        nothing = {"rig": which.id, "logs": 0, "results": 0, "quantities": []}
+        return TrendView(which.id, {**nothing, "notes": ["no run has a result yet", *notes]})
+    document = await site.work("trend", None, {"rows": found, "rig": which.id})
+    return TrendView(which.id, {**document, "notes": [*document["notes"], *notes]} if notes else document)
+
+
+def _left_out(site: Site, rig: str, *, archived: bool) -> list[str]:
+    """Return which results of a rig its history leaves out, in words.
+
+    A run that ended early has an interval of its own data. But its end, such as a fault, may have begun within these
+    data, and the operator may have stopped the run because something was wrong. So it is left out.
+    """
     from tdhil.fleet import counted
 
-    document = await site.work("trend", None, {"rows": found, "rig": which.id})
-    left = await off(lambda: sum(one.uploaded for one in site.list_runs(which.id, None, TREND_RUNS, archived=archived)))
-    notes = [f"{counted(left, 'uploaded recording')}: left out"] if left else []
-    return TrendView(which.id, {**document, "notes": [*document["notes"], *notes]} if left else document)
+    runs = site.list_runs(rig, None, TREND_RUNS, archived=archived)
+    uploaded = sum(one.uploaded for one in runs)
+    early = sum(one.inertia_kg_m2 is not None and one.state != "done" and not one.rehearsal for one in runs)
+    notes = [f"{counted(uploaded, 'uploaded recording')}: left out"] if uploaded else []
+    return [*notes, f"{counted(early, 'run')} with J that ended early: left out"] if early else notes
 
 
 async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:

@@ -152,3 +152,16 @@ def test_the_plain_list_has_the_same_conditions(call, many):
         query = "&".join(f"{name}={value}" for name, value in wanted.__dict__.items() if value)
         found = [one["id"] for one in call("GET", f"/runs?{query}", 200)]
         assert found == [one.id for one in many[::-1] if wanted.contains(one)]
+
+
+def test_a_history_says_which_results_of_runs_that_ended_early_it_leaves_out(call, service):
+    """They were left out in silence, though their pages show J."""
+    service.index.rebuild()
+    kinds = (("done", False), ("stopped", False), ("failed", False), ("failed", True))
+    for one, (state, rehearsal) in zip(rows(4), kinds, strict=True):
+        (service.store.runs / one.id).mkdir()
+        service.index.put(replace(one, rig="a", state=state, inertia_kg_m2=104.0, archived=False, rehearsal=rehearsal))
+    service.index.put(replace(rows(5)[4], rig="a", state="stopped", inertia_kg_m2=None))
+    notes = call("GET", "/rigs/a/trend", 200)["trend"]["notes"]
+    assert "2 runs with J that ended early: left out" in notes
+    assert call("GET", "/rigs/b/trend", 200)["trend"]["notes"] == ["no run has a result yet"]
