@@ -464,12 +464,19 @@
   /** Draw J's interval over time: inner band without, outer band with the torque scale; dashed: --tolerance about the last J. */
   function inertiaPlot(where) {
     let plot = null, known = [];
+    const { nearest, reading } = window.tdhil, read = reading(where, (at) => {
+      const one = known[nearest(known.map((each) => each.time_s), at)];
+      if (!one) return "–";
+      const said = tr("{time} s: J = {inertia} kg·m²", { time: fixed(one.time_s, 1), inertia: interval(one.inertia_kg_m2, one.low_kg_m2, one.high_kg_m2) });
+      const total = interval(one.inertia_kg_m2, one.low_total_kg_m2, one.high_total_kg_m2);
+      return total.includes("(") ? tr("{reading}, with the torque scale {inertia}", { reading: said, inertia: total }) : said;
+    });
     const data = () => ["time_s", "high_total_kg_m2", "low_total_kg_m2", "high_kg_m2", "low_kg_m2", "inertia_kg_m2"].map((name) => known.map((one) => one[name]));
     const draw = () => {
       if (plot) plot.destroy();
       const shade = colour("--c2"), edge = (width) => ({ stroke: shade, width, points: { show: false } });
       plot = new uPlot({
-        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
+        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: read.cursor,
         scales: { x: { time: false, range: () => {      // uPlot would begin at 0 for a single answer
           const low = known[0]?.time_s ?? 0, high = known[known.length - 1]?.time_s ?? 0, pad = 0.04 * (high - low) || 5;
           return [low - pad, high + pad];
@@ -477,7 +484,7 @@
         axes: [axis({ size: 34, values: (self, all) => all.map((one) => `${tick(one)} s`) }), axis({ size: 52 })],
         series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: shade, width: 2, points: { show: true, size: 7, fill: shade } }],
         bands: [{ series: [1, 2], fill: `${shade}22` }, { series: [3, 4], fill: `${shade}44` }],
-        hooks: { draw: [(self) => {
+        hooks: { setCursor: read.setCursor, draw: [(self) => {
           const last = known[known.length - 1];
           if (!last) return;
           const c = self.ctx;

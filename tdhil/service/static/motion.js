@@ -19,6 +19,19 @@
     return at - time[low] < time[high] - at ? low : high;
   }
 
+  /** Values of a chart under the cursor, in a line below it. `describe` takes a place on the x axis. Return parts of uPlot's options. */
+  function reading(where, describe) {
+    const hint = tr("Move over the chart to read its values."), line = el("p", { class: "readout dim" }, hint);
+    where.after(line);
+    return {
+      cursor: { y: false, points: { show: false }, drag: { x: false, y: false } },
+      setCursor: [(self) => {
+        const text = self.cursor.left >= 0 ? describe(self.posToVal(self.cursor.left, "x")) : hint;
+        if (line.textContent !== text) line.textContent = text;
+      }],
+    };
+  }
+
   function save(name, blob) {
     const href = URL.createObjectURL(blob);
     el("a", { href, download: name }).click();
@@ -178,5 +191,5 @@
     };
   }
 
-  window.tdhil.motion = motion;
+  Object.assign(window.tdhil, { motion, nearest, reading });
 })();

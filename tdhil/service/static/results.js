@@ -2,18 +2,21 @@
 "use strict";
 (() => {
   const { coded, english, errorText, fixed, local, point, precise, tr, word } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, number, ofResult, ofSpeed, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
   function resultOf(run) {
     const result = run.result;
     const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
-    if (run.error) parts.push(el("p", { class: run.state === "stopped" && run.stop.asked ? "dim" : "alarm" }, errorText(run.error)));
+    if (run.error) parts.push(el("p", { class: wanted(run) ? "dim" : "alarm" }, errorText(run.error)));
     if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, tr("Live"))));
     parts.push(...rehearsed(run));
     parts.push(...accepted(result));
-    if (!result) return parts;
+    if (!result) {
+      if (ENDED.includes(run.state) && run.files.includes("run.mcap")) parts.push(el("p", { class: "dim" }, tr("No J: the run ended before its data determined one. The recorded motion is kept.")));
+      return parts;
+    }
     const rows = [[tr("verdict"), word(result.verdict, "verdict")]];
     const J = result.inertia_kg_m2;
     const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
@@ -31,13 +34,13 @@
     }
     const card = el("div", { class: "card" },
       J ? el("p", { class: "figure large" }, `J = ${ofResult(result)}`) : null,
-      el("p", { class: `verdict ${VERDICTS[result.verdict] || ""}` }, word(result.verdict, "verdict")),
+      el("p", { class: `verdict ${wanted(run) && !J ? "" : VERDICTS[result.verdict] || ""}` }, word(result.verdict, "verdict")),
       region(tr("Numbers"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
       el("p", {}, ...coded(result.code, sentence(result.reason || ""))), result.advice ? el("p", {}, english(sentence(result.advice))) : null,
       run.rig && may("operator") && result.calibration_advised ? el("p", {}, el("a", { href: `/calibrate/${encodeURIComponent(run.rig)}` }, tr("Calibrate the torque of this rig"))) : null);
     parts.push(card);
-    const codes = result.warning_codes || [], wanted = run.state === "stopped" && run.stop.asked;
-    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, ...coded(codes[k], sentence(one)))));
+    const codes = result.warning_codes || [];
+    (result.warnings || []).forEach((one, k) => parts.push(el("p", { class: wanted(run) && codes[k] === ENDED_EARLY ? "dim" : "alarm" }, ...coded(codes[k], sentence(one)))));
     return parts;
   }
   /** Expected against identified, each by its interval, and what is off. */
@@ -75,17 +78,26 @@
     const lines = [...((result && result.budget) || [])].sort((a, b) => (b.half_width_kg_m2 ?? Infinity) - (a.half_width_kg_m2 ?? Infinity));
     if (!lines.length) return [];
     const most = Math.max(...lines.map((one) => one.half_width_kg_m2 ?? 0));
-    return [el("details", {}, el("summary", {}, tr("Uncertainty budget, in numbers")), region(tr("Uncertainty budget"), el("table", {},
+    return [el("section", {}, el("h2", {}, tr("Uncertainty budget")), region(tr("Uncertainty budget"), el("table", { class: "budget" },
       el("tbody", {}, ...lines.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.source, "budget")),
         el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`),
         el("td", {}, el("meter", { min: 0, max: most || 1, value: one.half_width_kg_m2 ?? 0, "aria-label": tr("share of the largest: {source}", { source: word(one.source, "budget") }) })),
-        el("td", { class: "dim" }, english(one.note))))))))];
+        el("td", { class: "dim" }, english(one.note))))))), el("p", { class: "dim said" }, byId("budget").dataset.said))];
   }
+  /** The stages of the recorded motion, folded: how each ended. */
+  function stagesOf(result) {
+    const stages = (result && result.stages) || [];
+    return stages.length ? [numbers(tr("Stages"), [tr("stage"), tr("outcome"), tr("time, s"), tr("reason")],
+      stages.map((one) => [word(one.name, "stage"), word(one.outcome, "outcome"), fixed(one.duration_s, 1), english(one.detail || "")]))] : [];
+  }
+  /** Whether an operator stopped the run on purpose: its end is no alarm. */
+  const wanted = (run) => run.state === "stopped" && Boolean(run.stop.asked) && !(run.watch && run.watch.lost);
 
   /** The report's pictures, and the friction curve in numbers below its own. */
   async function pictures(id, result) {
     const found = await call("GET", `/runs/${id}/pictures`);
-    show(byId("pictures"), ...found.flatMap((one) => [
+    const bars = ((result && result.budget) || []).length > 0;             // the page has its own bars of the budget
+    show(byId("pictures"), ...found.filter((one) => !bars || one.heading !== "Uncertainty budget").flatMap((one) => [
       el("h2", {}, word(one.heading)),
       el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]));
     const curve = (result && result.friction_curve) || [];
@@ -114,6 +126,7 @@
       shown = now;
       show(byId("result"), ...resultOf(run));
       show(byId("budget"), ...budgetOf(run.result));
+      show(byId("stages"), ...stagesOf(run.result));
       byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
       show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
@@ -392,21 +405,32 @@
     [1, ":{ss}", "\n{YYYY}-{MM}-{DD} {HH}:{mm}", null, "\n{MM}-{DD} {HH}:{mm}", null, "\n{HH}:{mm}", null, 1],
   ];
 
-  /** Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn again for another width or colour scheme. */
-  function points(where, series, { label, time = false, marks = [] }) {
-    const all = series.flatMap((one) => one.points);
-    const xs = [...new Set(all.map((one) => one.x))].sort((a, b) => a - b);
+  /**
+   * Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn again for another width or
+   * colour scheme. `place` names the place of a point, `unit` is that of its value. `speed`: x is a speed in rad/s.
+   */
+  function points(where, series, { label, place, unit, time = false, speed = false, marks = [] }) {
+    const all = series.flatMap((one) => one.points), shown = speed ? inSpeedUnit : (x) => x;
+    const places = [...new Set(all.map((one) => one.x))].sort((a, b) => a - b);
+    let xs = places.map(shown);
+    const read = reading(where, (at) => {
+      const x = places[nearest(xs, at)], valueOf = (one) => `${of(one)} ${unit}`;
+      const here = series.flatMap((one, k) => one.points.filter((point) => point.x === x).map((point) => [k, point]));
+      return `${place(here[0][1])}: ${here.map(([k, point]) => (series.length > 1 ? tr("run {number}: {value}", { number: k + 1, value: valueOf(point) }) : valueOf(point))).join("; ")}`;
+    });
     const low = Math.min(...all.map((one) => one.low ?? one.value)), high = Math.max(...all.map((one) => one.high ?? one.value));
-    const pad = 0.1 * (high - low) || 0.05 * Math.abs(high) || 1, side = Math.max(0.06 * (xs[xs.length - 1] - xs[0]), time ? 60 : 1e-3);
+    const pad = 0.1 * (high - low) || 0.05 * Math.abs(high) || 1, sideOf = () => Math.max(0.06 * (xs[xs.length - 1] - xs[0]), time ? 60 : 1e-3);
     let plot = null;
     const draw = () => {
       if (plot) plot.destroy();
+      xs = places.map(shown);
+      const side = sideOf();
       plot = new uPlot({
-        width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { show: false },
+        width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: read.cursor,
         scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
-        axes: [axis({ size: 48, label: time ? tr("local time, {zone}", { zone: zone(new Date(1000 * xs[xs.length - 1])) }) : label, labelSize: 22, ...(time ? { values: TIMES } : {}) }), axis({ size: 62 })],
+        axes: [axis({ size: 48, label: time ? tr("local time, {zone}", { zone: zone(new Date(1000 * xs[xs.length - 1])) }) : label(), labelSize: 22, ...(time ? { values: TIMES } : {}) }), axis({ size: 62 })],
         series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
-        hooks: { draw: [(self) => {
+        hooks: { setCursor: read.setCursor, draw: [(self) => {
           const c = self.ctx, px = devicePixelRatio;
           c.save();
           c.lineWidth = 2 * px;
@@ -421,7 +445,7 @@
             c.strokeStyle = c.fillStyle = colour(one.colour);
             const shift = (k - (series.length - 1) / 2) * 5 * px;         // points at one place are drawn side by side
             for (const point of one.points) {
-              const x = self.valToPos(point.x, "x", true) + shift;
+              const x = self.valToPos(shown(point.x), "x", true) + shift;
               if (point.low !== null && point.high !== null) {
                 c.beginPath(); c.moveTo(x, self.valToPos(point.low, "y", true)); c.lineTo(x, self.valToPos(point.high, "y", true)); c.stroke();
               }
@@ -435,6 +459,7 @@
     draw();
     new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 240 })).observe(where);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+    if (speed) onSpeedUnit(draw);
   }
 
   async function once(where, look, text = tr("Loading"), kind = "faults") {
@@ -468,7 +493,7 @@
           el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot, el("p", { class: "dim said" }, where.dataset.said)),
           numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
-          { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
+          { time: true, place: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
     }, tr("The results are compared"), "history");
   }
@@ -489,13 +514,13 @@
       const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
         tr("{quantity}, {run} against 1", { quantity: word(other.name), run: k + 2 }), other.differs ? tr("differs") : tr("no significant difference"),
         other.relative ? tr("{value} ({low} to {high})", { value: percentOf(other.change), low: percentOf(other.low), high: percentOf(other.high) }) : `${tr("{value} ({low} to {high})", { value: number(other.change, 3), low: number(other.low, 3), high: number(other.high, 3) })} ${other.unit}`]));
-      const curve = (title, label, key, x, said) => {
+      const curve = (title, label, key, x, said, unit, place, speed = false) => {
         const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
         if (!series.some((one) => one.points.length)) return [];
         const plot = el("div", { class: "plot", role: "img", "aria-label": title });
-        setTimeout(() => points(plot, series, { label }), 0);             // after it has a width
+        setTimeout(() => points(plot, series, { label, place, unit, speed }), 0);             // after it has a width
         return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot, el("p", { class: "dim said" }, said)),
-          numbers(tr("{title}, in numbers", { title }), [label, ...names], tabled(series))];
+          numbers(tr("{title}, in numbers", { title }), [speed ? ofSpeed(label) : label(), ...names], tabled(series, speed ? (x) => ofSpeed(() => number(inSpeedUnit(x))) : number))];
       };
       show(where, ...said,
         region(tr("Results"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...heads)), el("tbody", {},
@@ -503,8 +528,8 @@
           line(tr("J, repeatability, kg·m²"), comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_kg_m2, one.inertia_high_kg_m2) ?? "–")),
           line(tr("verdict"), comparison.results.map((one) => word(one.verdict, "verdict")))))),
         others.length ? numbers(tr("Friction and lags"), [tr("quantity"), "", tr("difference")], others) : null,
-        ...curve(tr("Apparent inertia by frequency, kg·m²"), tr("frequency, Hz"), "apparent_inertia", "hertz", where.dataset.said),
-        ...curve(tr("Friction, N·m"), tr("speed, rad/s"), "friction", "speed_rad_s", where.dataset.frictionSaid),
+        ...curve(tr("Apparent inertia by frequency, kg·m²"), () => tr("frequency, Hz"), "apparent_inertia", "hertz", where.dataset.said, "kg·m²", (one) => `${number(one.x)} Hz`),
+        ...curve(tr("Friction, N·m"), () => tr("speed, {unit}", { unit: speedUnit() }), "friction", "speed_rad_s", where.dataset.frictionSaid, "N·m", (one) => `${number(inSpeedUnit(one.x))} ${speedUnit()}`, true),
         el("h2", {}, tr("Settings")), el("p", { class: "dim" }, tr("≠ marks different settings.")),
         region(tr("Settings"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
           el("tbody", {}, ...comparison.settings.map((one) => line(el("span", {}, one.differs ? "≠ " : "", english(one.name)), one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: tr("yes"), False: tr("no") }[value] ?? english(value))), one.differs))))));
@@ -513,9 +538,9 @@
   const percentOf = (share) => `${share > 0 ? "+" : ""}${precise(100 * share, 2)} %`;
   const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
   /** A row for each place, a cell for each series; the mean of several points at one place. */
-  function tabled(series) {
+  function tabled(series, place = number) {
     const xs = [...new Set(series.flatMap((one) => one.points.map((point) => Number(point.x.toPrecision(6)))))].sort((a, b) => a - b);
-    return xs.map((x) => [number(x), ...series.map((one) => {
+    return xs.map((x) => [place(x), ...series.map((one) => {
       const here = one.points.filter((point) => Number(point.x.toPrecision(6)) === x).map((point) => point.value);
       return here.length ? number(here.reduce((sum, value) => sum + value, 0) / here.length) : "–";
     })]);

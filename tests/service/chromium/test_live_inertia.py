@@ -52,6 +52,19 @@ def test_j_so_far_is_shown_with_interval_p_and_least_time(page, served):
 
 
 @pytest.mark.heavy
+def test_j_so_far_can_be_read_at_each_time(page, served):
+    run = played(served, FIRST, LAST)
+    page.goto(f"/runs/{run}/live")
+    over = page.locator("#plot-inertia .u-over")
+    over.scroll_into_view_if_needed()
+    for place, shown in ((0.05, "0.8 s: J = 103.0 (96.0 to 110.0) kg·m², with the torque scale 103.0 (94.0 to 112.0)"),
+                         (0.95, f"1.6 s: J = {SHOWN}, with the torque scale 104.2 (100.0 to 108.4)")):
+        box = over.bounding_box()
+        page.mouse.move(box["x"] + place * box["width"], box["y"] + 40, steps=3)
+        page.locator("#plot-inertia + .readout", has_text=shown).wait_for()
+
+
+@pytest.mark.heavy
 def test_the_last_value_is_the_one_of_the_result(page, served):
     """The same numbers are shown with the same digits: live with the repeatability, and in the result's own key."""
     run = played(served, FIRST, LAST)

@@ -1,0 +1,116 @@
+"""Values under the cursor in the charts of J, of a rig's history and of compared runs; the page of a run that ended
+early, in Chromium."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import pytest
+
+from tdhil.service.store import write_json
+from tests.service.chromium.pages import IN_CHROMIUM, begin, estimate, results
+
+pytestmark = IN_CHROMIUM
+
+
+def ended(served: Any) -> str:
+    run = str(served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id)
+    served.service.wait(run, "done")
+    return run
+
+
+def stopped(served: Any) -> str:
+    run = begin(served)
+    served.service.supervisor.stop(run, "anna")
+    served.service.wait(run, "stopped")
+    return run
+
+
+def read(page: Any, plot: Any, share: float) -> str:
+    over = plot.locator(".u-over")
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    page.mouse.move(box["x"] + share * box["width"], box["y"] + 40, steps=3)
+    return str(plot.locator("xpath=following-sibling::p").first.inner_text())
+
+
+def test_a_history_and_a_comparison_show_the_values_under_the_cursor(page, served, monkeypatch):
+    _, compare, history, _ = results(served, ended(served), monkeypatch)
+    page.goto(history)
+    plot = page.locator(".plot").first
+    plot.locator("canvas").wait_for()
+    assert re.search(r"^2026-05-01 .*: 104\.0 \(103\.0 to 105\.0\) kg·m²$", read(page, plot, 0.1))
+    assert re.search(r"^2026-06-01 .*: 99\.00 \(98\.01 to 99\.99\) kg·m²$", read(page, plot, 0.9))
+    page.mouse.move(1, 1)
+    page.get_by_text("Move over the chart to read its values.").wait_for()
+    page.goto(compare)
+    plot = page.locator(".plot").first
+    plot.locator("canvas").wait_for()
+    inertia = "104.0 (103.0 to 105.0) kg·m²"
+    assert read(page, plot, 0.1) == f"0.1000 Hz: run 1: {inertia}; run 2: {inertia}"
+
+
+def test_the_friction_of_compared_runs_follows_the_unit_of_speed(page, served, monkeypatch):
+    run = ended(served)
+    _, compare, _, _ = results(served, run, monkeypatch)
+    work = served.service.supervisor.work
+    friction = [{"speed_rad_s": speed, **estimate(60.0 + 8.0 * speed)} for speed in (2.0, 5.0)]
+
+    def with_friction(what: str, run: Any, asked: Any) -> Any:
+        found = work(what, run, asked)
+        return {"document": {**found["document"], "friction": [friction, friction[:1]]}}
+
+    monkeypatch.setattr(served.service.supervisor, "work", with_friction)
+    page.goto(compare)
+    plot = page.locator(".plot").nth(1)
+    plot.locator("canvas").wait_for()
+    assert read(page, plot, 0.95) == "5 rad/s: run 1: 100.0 (99.0 to 101.0) N·m"
+    page.locator("#speed-unit").click()
+    assert read(page, plot, 0.95) == "47.75 rpm: run 1: 100.0 (99.0 to 101.0) N·m"
+    page.get_by_text("Friction, N·m, in numbers").click()
+    page.get_by_role("columnheader", name="speed, rpm").wait_for()
+    page.get_by_role("rowheader", name="47.75", exact=True).wait_for()
+
+
+@pytest.mark.parametrize("how", ["stopped", "lost", "failed"])
+def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served, how):
+    """A stop on purpose is no alarm; a lost watch and a fault are."""
+    run = stopped(served)
+    folder = served.service.store.place(run)
+    state = json.loads((folder / "state.json").read_bytes())
+    error = {"kind": "Interrupted", "message": "interrupted: anna requested a stop", "where": "", "next_step": "",
+             "what": "interrupted: anna requested a stop", "exit_code": 143, "code": "TDH-1300"}
+    at = state["history"][-1]["at"]
+    watch = {"by": "anna", "since": at, "gone": at, "how": "closed", "lost": at} if how == "lost" else None
+    if how == "failed":
+        state["history"][-1]["state"] = "failed"
+    write_json(folder / "state.json", {**state, "error": error, "watch": watch})
+    inertia = {**estimate(104.0), "low_total": 100.0, "high_total": 108.0, "half_width_total_rel": 0.04,
+               "repeatability_rel": 0.01}
+    write_json(folder / "result.json", {
+        "verdict": "valid_wide", "inertia_kg_m2": inertia, "reason": "a part", "warnings": ["the run was aborted"],
+        "warning_codes": ["TDH-030"],
+        "budget": [{"source": source, "half_width_kg_m2": half, "note": ""}
+                   for source, half in (("noise", 0.2), ("torque scale", 4.0), ("timing", 1.0))],
+        "stages": [{"name": "setup", "outcome": "ok", "duration_s": 3.7},
+                   {"name": "acquire", "outcome": "aborted", "duration_s": 60.0, "detail": "anna requested a stop"}],
+    })
+    page.goto(f"/runs/{run}")
+    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").first.wait_for()
+    bars = page.get_by_role("region", name="Uncertainty budget").get_by_role("row")
+    assert [one.get_by_role("rowheader").inner_text() for one in bars.all()] == ["torque scale", "timing", "noise"]
+    assert bars.first.get_by_role("meter").is_visible()
+    table = page.get_by_role("region", name="Stages")
+    assert not table.is_visible()
+    page.get_by_text("Stages", exact=True).click()
+    table.get_by_role("row", name="acquire").get_by_text("anna requested a stop").wait_for()
+    assert page.locator("#result .alarm").count() == (0 if how == "stopped" else 2)
+
+
+def test_a_run_that_ended_before_its_data_determined_j_says_so(page, served):
+    run = stopped(served)
+    page.goto(f"/runs/{run}")
+    page.get_by_text("No J: the run ended before its data determined one").wait_for()
+    assert page.locator("#result .alarm").count() == 0
