@@ -4,11 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol, TypeVar
 
-if TYPE_CHECKING:
-    from tdhil.service.store import Summary
 
+class Row(Protocol):
+    """Row of a list of runs, as far as a filter uses it (`tdhil.service.store.Summary`)."""
+
+    @property
+    def id(self) -> str: ...
+    @property
+    def rig(self) -> str: ...
+    @property
+    def state(self) -> str: ...
+    @property
+    def verdict(self) -> str | None: ...
+    @property
+    def tags(self) -> tuple[str, ...]: ...
+    @property
+    def archived(self) -> bool: ...
+    def contains(self, text: str) -> bool: ...
+
+
+T = TypeVar("T", bound=Row)
 SEARCHED_COLUMN: Final = "searched"
 """Column of the index with the text of a row in lower case, so that a search calls no function for each row."""
 SORTS: Final = {
@@ -34,7 +51,7 @@ class RunFilter:
     archived: bool = False
     until: str | None = None
 
-    def contains(self, one: Summary) -> bool:
+    def contains(self, one: Row) -> bool:
         """Return whether a row meets the conditions."""
         return (
             self.rig in (None, one.rig) and self.state in (None, one.state) and self.verdict in (None, one.verdict)
@@ -77,7 +94,7 @@ class Order:
         parts = (f"{name} is null, {name} collate nocase {way}" for name in SORTS[self.key])
         return f"order by {', '.join(parts)}, id desc"
 
-    def sorted(self, rows: Iterable[Summary]) -> list[Summary]:
+    def sorted(self, rows: Iterable[T]) -> list[T]:
         """Return rows in this order, as the index does."""
         if self.key == "id":
             return sorted(rows, key=lambda one: one.id, reverse=self.down)

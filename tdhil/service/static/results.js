@@ -97,7 +97,7 @@
   async function pictures(id, result) {
     const found = await call("GET", `/runs/${id}/pictures`);
     const bars = ((result && result.budget) || []).length > 0;             // the page has its own bars of the budget
-    show(byId("pictures"), ...found.filter((one) => !bars || one.heading !== "Uncertainty budget").flatMap((one) => [
+    show(byId("pictures"), ...found.filter((one) => !bars || one.heading !== byId("budget").dataset.heading).flatMap((one) => [
       el("h2", {}, word(one.heading)),
       el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]));
     const curve = (result && result.friction_curve) || [];

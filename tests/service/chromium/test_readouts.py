@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tdhil.report.blocks import UNCERTAINTY_BUDGET
 from tdhil.service.store import write_json
 from tests.service.chromium.pages import IN_CHROMIUM, begin, estimate, results
 
@@ -97,8 +98,14 @@ def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served
         "stages": [{"name": "setup", "outcome": "ok", "duration_s": 3.7},
                    {"name": "acquire", "outcome": "aborted", "duration_s": 60.0, "detail": "anna requested a stop"}],
     })
+    svg = "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 9 9'><path d='M0 0L9 9' stroke='red'/></svg>"
+    (folder / "report.html").write_text("".join(
+        f"<h2>{heading}</h2><figure>{svg}<figcaption>said</figcaption></figure>"
+        for heading in ("Speed and torque", UNCERTAINTY_BUDGET.capitalize())))
     page.goto(f"/runs/{run}")
     page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").first.wait_for()
+    assert page.get_by_role("heading", name="Speed and torque").count() == 1
+    assert page.get_by_role("heading", name="Uncertainty budget").count() == 1       # its picture is left out
     bars = page.get_by_role("region", name="Uncertainty budget").get_by_role("row")
     assert [one.get_by_role("rowheader").inner_text() for one in bars.all()] == ["torque scale", "timing", "noise"]
     assert bars.first.get_by_role("meter").is_visible()
