@@ -68,6 +68,7 @@ def test_the_plan_is_of_the_typed_motion_and_a_refusal_marks_its_fields(page, se
     assert all(one.is_visible() for one in marked)
 
 
+@pytest.mark.heavy
 def test_a_typed_speed_follows_the_unit_of_the_page(page, served):
     """A number without a unit is in the unit beside its label. The switch changes both, so the speed stays the same."""
     opened(page)

@@ -53,6 +53,7 @@ def test_a_history_and_a_comparison_show_the_values_under_the_cursor(page, serve
     assert read(page, plot, 0.1) == f"0.1000 Hz: run 1: {inertia}; run 2: {inertia}"
 
 
+@pytest.mark.heavy
 def test_the_friction_of_compared_runs_follows_the_unit_of_speed(page, served, monkeypatch):
     run = ended(served)
     _, compare, _, _ = results(served, run, monkeypatch)
@@ -75,6 +76,7 @@ def test_the_friction_of_compared_runs_follows_the_unit_of_speed(page, served, m
     page.get_by_role("rowheader", name="47.75", exact=True).wait_for()
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("how", ["stopped", "lost", "failed"])
 def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served, how):
     """A stop on purpose is no alarm; a lost watch and a fault are."""
