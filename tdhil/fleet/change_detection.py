@@ -226,7 +226,8 @@ class _Inverse:
         scaled = weight[:, None] * known.shared
         capacitance = np.eye(scaled.shape[1]) + known.shared.T @ scaled
         log_det = float(np.log(weight).sum() - np.linalg.slogdet(capacitance)[1])
-        return cls(weight, scaled, np.linalg.inv(capacitance), log_det)
+        inner: FloatArray = np.asarray(np.linalg.inv(capacitance), dtype=np.float64)
+        return cls(weight, scaled, inner, log_det)
 
     def times(self, columns: FloatArray) -> FloatArray:
         """Return Σ⁻¹ times columns (n, m)."""
@@ -261,7 +262,8 @@ def _evidence(known: _Series) -> _ChangeEvidence:
         weight, scaled = inverse.weight, inverse.scaled
         ones, of_x, of_rise = inverse.times(np.column_stack((np.ones(n), x, rise))).T
         total = float(ones.sum())
-        weights.append(math.log(prior) + 0.5 * (inverse.log_det - math.log(total) - float(x @ of_x - of_x.sum() ** 2 / total)))
+        misfit = float(x @ of_x - of_x.sum() ** 2 / total)
+        weights.append(math.log(prior) + 0.5 * (inverse.log_det - math.log(total) - misfit))
         tails = _after(scaled)
         own = np.append(_after(weight) - np.sum((tails @ inverse.inner) * tails, axis=1), rise @ of_rise)       # hᵀΣ⁻¹h
         level = np.append(_after(ones), rise @ ones)                                                    # hᵀΣ⁻¹1

@@ -70,13 +70,14 @@ def test_the_evidence_is_that_of_the_densities(monkeypatch):
     each = [math.exp(multivariate_normal.logpdf(x, np.full(n, 4.6), covariance + size**2 * np.outer(h, h)) - none)
             for h in shapes]
     weights = [0.5, 0.25 * np.mean(each[:-1]), 0.25 * each[-1]]
-    found = change_detection._evidence(change_detection._Series(x, sd, of_drive, own, time))
+    known = change_detection._Series(x, sd, of_drive, own, time)
+    found = change_detection._evidence(known)
     assert [found.none, found.step, found.drift] == pytest.approx(np.array(weights) / sum(weights), rel=1e-3)
     assert found.places == pytest.approx(np.array(each[:-1]) / sum(each[:-1]), rel=1e-3)
     inverse = np.linalg.inv(covariance)
     design = np.column_stack((np.ones(n), shapes[2]))
     fit = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ x)
-    ((size, deviation),) = change_detection._sizes(x, sd, shared, [3])
+    ((size, deviation),) = change_detection._sizes(known, [3])
     assert size == pytest.approx(fit[1], rel=1e-3)
     assert deviation == pytest.approx(math.sqrt(np.linalg.inv(design.T @ inverse @ design)[1, 1]), rel=1e-3)
 
