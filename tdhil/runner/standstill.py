@@ -10,6 +10,7 @@ A shaft stands still once all of these have held for long enough:
   torque, or torque mode with zero torque. A statusword without a valid state proves nothing.
 
 "Long enough" is the time in which every lag decays, and in which friction stops a motion that the reports can hide.
+After the drive has removed its torque in motion, it is at least the longest time for which the shaft may coast.
 """
 
 from __future__ import annotations
@@ -95,4 +96,4 @@ class Standstill:
             self._noise.restart()
             return False
         shown = without_torque or sample.standstill or sample.state in NO_TORQUE
-        return shown and sample.time_s - self._since_s >= self.settle_s
+        return shown and sample.time_s - self._since_s >= self.settle_s and observer.coasts_s <= 0.0

@@ -345,7 +345,7 @@ class StopSequence:
         came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._loop.period_s
         patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
         since_s, held_nm = 0.0, self._torque_held_nm()
-        while not patience.over:
+        while not patience.over or self._loop.guard.observer.coasts_s > 0.0:
             speed = math.copysign(max(0.0, abs(speed) - step), came_from)
             sample = self._exchange(Command(Mode.SPEED, speed, held_nm))
             since_s += self._loop.period_s
@@ -551,7 +551,7 @@ class StopSequence:
         """
         rest = Standstill(self._loop.guard.observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
         patience = StopTimeout(self._enough_s + rest.settle_s, self._at_rest_rad_s)
-        while not patience.over:
+        while not patience.over or self._loop.guard.observer.coasts_s > 0.0:
             sample = self._exchange(_NO_TORQUE_ASKED)
             if sample is None:
                 if self._silent >= self._enough_silent:
@@ -608,7 +608,7 @@ class StopSequence:
         rest = Standstill(observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
         patience = StopTimeout(self._enough_s + rest.settle_s - self._settle_s, self._at_rest_rad_s)
         braking = Slowing(self._at_rest_rad_s, self._unmoved_s)
-        while not patience.over:
+        while not patience.over or self._loop.guard.observer.coasts_s > 0.0:
             asked = asked or self._ask(self._loop.drive.quick_stop)
             sample = self._exchange(_REST, or_poll=True)
             if sample is None:

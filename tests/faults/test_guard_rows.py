@@ -303,17 +303,17 @@ def test_rows_20_to_23_what_the_driver_raises(stage, error, code):
 @pytest.mark.parametrize("state", [PowerState.OFF, PowerState.READY, PowerState.QUICK_STOP, PowerState.FAULT])
 def test_rows_31_33_a_drive_that_leaves_its_state(stage, state):
     def begin(here):
-        here.drive.state = here.drive.wish = state
-        if state in (PowerState.OFF, PowerState.READY):
-            here.drive.coulomb = 400.0                     # it runs out, and not for ever
+        here.drive.state = here.drive.wish = state         # without torque it runs out, longer than every lag
 
     ended = run(stage, begin)
     assert isinstance(ended.result.cause, DriveFault)
-    assert ended.code is ExitCode.DRIVE_FAULT
     assert state.value in str(ended.result.cause)
     assert ended.result.cause.where.startswith("statusword")
-    assert ended.result.stop.at_rest_s is not None
     assert ended.here.drive.speed == pytest.approx(0.0, abs=0.05)
+    # Before J is known, a slow shaft stops within the lags of its report: a lost signal would look the same.
+    hidden = stage == "speed" and state in (PowerState.OFF, PowerState.READY)
+    assert ended.result.stop.confirmed is not hidden
+    assert ended.code is ExitCode.DRIVE_FAULT              # of the cause; a stop without confirmation makes it 8
 
 
 def test_row_31_a_drive_that_is_never_enabled():

@@ -126,7 +126,8 @@ def test_a_drive_fault_in_each_stage(world, stage):
     result = here.runner().run()
     assert isinstance(result.cause, DriveFault)
     assert outcomes(result) == up_to(stage)
-    assert result.stop.confirmed
+    # At the beginning of stage 2 the shaft is slow, and J is not known: a lost signal would fall as its speed does.
+    assert result.stop.confirmed is (stage != "speed")
     assert here.drive.speed == 0.0
     assert here.drive.state is PowerState.FAULT     # left for the operator to see
 

@@ -20,6 +20,7 @@ class Observed:
     position_quiet: bool = True
     blind_s: float = 0.0
     unseen_s: float = 0.0
+    coasts_s: float = 0.0
     by_position: float | None = None
     rest_share: float = 1.0
     doubt: object = None
@@ -86,6 +87,10 @@ def test_it_lasts_as_long_as_the_observer_asks_for(observed):
 
 def test_an_observer_that_asks_for_less_shortens_nothing():
     assert rested_after(Observed(blind_s=0.1, unseen_s=0.1)) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
+
+
+def test_a_shaft_that_may_still_coast_is_not_at_standstill():
+    assert rested_after(Observed(coasts_s=0.1)) is None
 
 
 def at_seconds(seconds, *reports):

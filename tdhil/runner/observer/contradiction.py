@@ -26,3 +26,4 @@ class Contradiction:
     helps: str
     time_s: float
     lighter: bool = False              # True: a smaller inertia explains it, so a part of the load may be lost
+    lag_hides: bool = False            # True: a lost signal may fall like this shaft until every lag has ended

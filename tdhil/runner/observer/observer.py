@@ -9,6 +9,7 @@ from drivers import STANDSTILL_ANGLE_RAD_S, Command, Mode, PositionReading, Powe
 from profiles.quantities import in_nm
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.observer.contradiction import Contradiction, Signal
+from tdhil.runner.observer.left_operation import LeftOperation
 from tdhil.runner.observer.momentum_balance import HIDDEN_SHARE, WINDOWS_S, MomentumBalance
 from tdhil.runner.observer.points import AROUND_S, POINT_S, SLOPE_S, STALE_S, Point
 from tdhil.runner.observer.position_way import PositionWay, Way
@@ -113,6 +114,7 @@ class Observer:
         self._unseen_nm = 0.0
         self._moved = False
         self._powered = self._coasting = False
+        self._left: LeftOperation | None = None
         self._restart()
 
     # -- knowledge of the shaft and the drive -------------------------------------------------------------------
@@ -280,7 +282,8 @@ class Observer:
             return True
         if self._position_lives:
             return True
-        return self._revival is not None and self._revival.alive and self._balanced
+        followed = self._revival is not None and (self._revival.alive or self._braked)
+        return followed and self._balanced
 
     def rest_rad_s(self, at_rest_rad_s: float) -> float:
         """Return the speed that counts as standstill, rad/s; a lower one after a contradiction, as the scale may be
@@ -297,6 +300,14 @@ class Observer:
         """
         rate = self.rate_rad_s
         return rate is None or abs(rate) <= min(at_rest_rad_s, STANDSTILL_ANGLE_RAD_S) + self._angles.blur_rad_s
+
+    @property
+    def _braked(self) -> bool:
+        """Return whether the reported torque stopped the shaft after the drive left operation.
+
+        A drive that has lost its speed signal does not brake with it: the torque then drives the shaft on.
+        """
+        return self._left is not None and self._left.braked(self._bounds.inertia_high)
 
     @property
     def _balanced(self) -> bool:
@@ -320,6 +331,17 @@ class Observer:
         the reported speed then leaves standstill at the rate of friction.
         """
         return self._bounds.shows_s(at_rest_rad_s, torque_nm)
+
+    @property
+    def coasts_s(self) -> float:
+        """Longest time for which the shaft may still turn after the drive left operation in motion, s; 0 if it did not.
+
+        The lag of the report hides a speed that was lost at the same moment: it falls nearly as a shaft that coasts.
+        """
+        left = self._left
+        if left is None or self._braked:
+            return 0.0
+        return max(0.0, left.time_s + self._bounds.coasts_s(left.speed_rad_s) - self._time_s)
 
     def runs_away(self, sample: Sample) -> str:
         """Return the evidence that the shaft accelerates against the quick stop, in two independent ways; '' without
@@ -378,10 +400,12 @@ class Observer:
                 f" {self._limits.torque_nm:g} N·m",
                 "Check the units of torque in the profile and the rated torque", point.time_s,
             )
+        if self._left is not None:
+            self._left.see(point, turns=self.turns(point.speed))
         if sample.state in (PowerState.ENABLED, PowerState.QUICK_STOP):
             self._powered = True
             self._compare(point, command, block_s)
-        elif sample.state is PowerState.FAULT_REACTION or self._lost_torque_in_motion(point.time_s):
+        elif self._left_operation_in_motion(point.time_s) or sample.state is PowerState.FAULT_REACTION:
             self._contradict(self._balance.see(self._points, known, self._noise_rad_s()))
         if (apart := self._torques.see(command, sample, self.torque_offset_nm, block_s)) is not None:
             self._doubt(frozenset({Signal.TORQUE}), *apart, sample.time_s)
@@ -439,20 +463,26 @@ class Observer:
             self._unseen_nms += abs(point.torque) * block_s
             self._unseen_nm = max(self._unseen_nm, abs(point.torque))
 
-    def _lost_torque_in_motion(self, now_s: float) -> bool:
-        """Return whether the drive removed its torque while the shaft turned. Then friction alone stops the shaft.
+    def _left_operation_in_motion(self, now_s: float) -> bool:
+        """Return whether the drive left operation by itself while the shaft turned: it removed its torque, or brakes
+        after a fault.
 
-        A drive whose sensor failed with it, or that reports no speed without torque, shows zero at once. While J is not
-        known, the speed is in doubt until it falls as under a quick stop, or more slowly (`Revival`).
+        A drive whose sensor failed with it, or that reports no speed without torque, shows zero at once, or falls to it
+        with its lag. While J is not known, the speed is in doubt until it falls gradually after every lag has ended
+        (`Revival`), or has been braked by the reported torque. A fault reaction counts from its beginning: at its end
+        the lagging speed has little left to fall.
         """
         if self._powered:
             self._powered = False
             recent = (one.speed for one in self._points if now_s - one.time_s <= POWER_LOSS_S)
             self._coasting = any(map(self.turns, recent))
+            if self._coasting:
+                self._left = LeftOperation(self._points[-1])
             if self._coasting and not self._bounds.known:
-                self._doubt(
-                    frozenset({Signal.SPEED}), "the drive removed its torque while the shaft turned, and the inertia is"
-                    " not known yet", "Look at the shaft: the drive may report no speed without torque", now_s)
+                self._contradict(Contradiction(
+                    frozenset({Signal.SPEED}), "the drive left operation while the shaft turned, and the inertia is not"
+                    " known yet", "Look at the shaft: the drive may report no speed without torque", now_s,
+                    lag_hides=True))
         return self._coasting
 
     def _compare(self, point: Point, command: Command, block_s: float) -> None:
@@ -510,10 +540,10 @@ class Observer:
         self.doubt, time_s = found, found.time_s
         slope, still = self._limits.quick_stop_rad_s2, self._still_rad_s
         recent = [point for point in self._points if time_s - point.time_s <= BEFORE_S]
-        steady = True
+        steady = not found.lag_hides
         if recent:
             fastest = max(recent, key=lambda point: abs(point.speed))
             braked = RAMP_SLACK * slope * (recent[-1].time_s - fastest.time_s) if self._runaway.begun else 0.0
-            steady = abs(recent[-1].speed) >= KEPT_SHARE * abs(fastest.speed) - braked
+            steady = steady and abs(recent[-1].speed) >= KEPT_SHARE * abs(fastest.speed) - braked
         self._revival = Revival(steady, time_s + max(ALIVE_S, ALIVE_LAGS * self._lag_s), slope, still)
         self._angle_revival = Revival(steady, time_s + ALIVE_S, slope, still + self._angles.blur_rad_s)

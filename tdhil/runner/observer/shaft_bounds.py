@@ -212,6 +212,16 @@ class ShaftBounds:
             return math.inf
         return 2.0 * at_rest_rad_s * self.inertia_high / (RUN_OUT_SHARE * model.coulomb_nm)
 
+    def coasts_s(self, speed_rad_s: float) -> float:
+        """Return the longest time for which the shaft turns without torque from this speed, s; 0 above a string, and
+        before stage 2 has ended.
+        """
+        if self._model is None or self._limits.has_drill_string:
+            return 0.0
+        if self.breakaway_low_nm <= 0.0:
+            return RUN_OUT_S
+        return min(RUN_OUT_S, self.inertia_high * abs(speed_rad_s) / self.breakaway_low_nm)
+
     def blind_s(self, still_rad_s: float) -> float:
         """Return the longest time in which friction stops a motion that (1) cannot detect, s."""
         model = self._model

@@ -1,0 +1,50 @@
+"""A drive that left operation in motion: did the reported torque stop the shaft?"""
+
+import math
+
+import pytest
+
+from tdhil.runner.observer.left_operation import LeftOperation
+from tdhil.runner.observer.points import Point
+
+STEP_S = 0.04
+J_KG_M2 = 100.0
+
+
+def point(time_s, speed_rad_s, impulse_nms):
+    found = Point()
+    found.time_s, found.speed, found.impulse = time_s, speed_rad_s, impulse_nms
+    return found
+
+
+def followed(torque_nm, from_rad_s=2.0, lag_s=0.4, stop_s=1.0, later_nm=0.0):
+    """A reported speed that lags a ramp to zero, beside a constant torque while it falls; ``later_nm`` from 3 s on."""
+    points = [point(0.0, from_rad_s, 0.0)]
+    left, speed, impulse = LeftOperation(points[0]), from_rad_s, 0.0
+    for k in range(1, 120):
+        true = from_rad_s * max(0.0, 1.0 - k * STEP_S / stop_s)
+        speed += (true - speed) * STEP_S / lag_s
+        impulse += STEP_S * (torque_nm if k * STEP_S < stop_s else later_nm if k * STEP_S > 3.0 else 0.0)
+        left.see(point(k * STEP_S, speed, impulse), turns=abs(speed) > 0.2)
+    return left
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize(("torque_nm", "found"), [(-150.0, True), (-15.0, False), (0.0, False), (150.0, False)])
+def test_only_a_braking_torque_stops_a_shaft(way, torque_nm, found):
+    assert followed(way * torque_nm, from_rad_s=way * 2.0).braked(J_KG_M2) is found
+
+
+def test_without_a_bound_of_j_nothing_is_known():
+    assert not followed(-150.0).braked(math.inf)
+
+
+def test_torque_after_the_stop_does_not_count():
+    """An error of the torque's zero would add up to any impulse."""
+    assert not followed(0.0, later_nm=-50.0).braked(J_KG_M2)
+
+
+def test_a_shaft_that_still_turns_has_not_been_stopped():
+    left = LeftOperation(point(0.0, 2.0, 0.0))
+    left.see(point(0.5, 1.0, -100.0), turns=True)
+    assert not left.braked(J_KG_M2)
