@@ -15,7 +15,7 @@ from drivers.clock import SteppedClock
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, DriveFault, TdhilError
 from drivers.quick_stop import (
-    LONGEST_S,
+    LONGEST_STOP_S,
     NO_SLOWER_S,
     PAUSE_S,
     QUIET_S,
@@ -108,7 +108,7 @@ def never_released(pieces):
         read = any(one.seen is not None for one in past)
         assert past[-1].time_s - (heard[-1] if heard else 0.0) > SILENT_S or not read
     if course.ended is Ended.TURNING:
-        assert past[-1].time_s > min(NO_SLOWER_S, LONGEST_S)
+        assert past[-1].time_s > min(NO_SLOWER_S, LONGEST_STOP_S)
 
 
 def test_every_state_has_its_row_and_no_row_disables():
