@@ -58,7 +58,8 @@ def change_letterhead(
         write_json(store.folder / FILE, found.plain())
     except OSError as error:
         raise LogError(f"the letterhead can't be written ({error.strerror or error})", where="letterhead",
-                       next_step="Nothing was changed. Check the folder of the service") from error
+                       next_step="Nothing was changed. Free some disk space, or check the folder"
+                       " of the service") from error
     return found
 
 

@@ -164,7 +164,8 @@ class RunRecords:
             except OSError as error:
                 self._supervisor.note(who, "signature failed", run, request.rig, why=str(error))
                 raise LogError(f"the signature can't be written ({error.strerror or error})", where=where,
-                               next_step="Nothing was signed. Check the folder of the service") from error
+                               next_step="Nothing was signed. Free some disk space, or check the folder"
+                               " of the service") from error
 
     # -- evidence ----------------------------------------------------------------------------------------------------
 
@@ -209,7 +210,8 @@ class RunRecords:
             except OSError as error:
                 self._supervisor.note(who, "edit failed", run, recorded.rig, why=str(error))
                 raise LogError(f"the annotations can't be written ({error.strerror or error})", where=f"run {run}",
-                               next_step="Nothing was changed. Check the folder of the service") from error
+                               next_step="Nothing was changed. Free some disk space, or check the folder"
+                               " of the service") from error
         self._supervisor.reindex(run)
 
     def _require_settled(self, run: str) -> None:
@@ -252,4 +254,5 @@ class RunRecords:
             self._supervisor.audit.note(who, what, run=run, rig=rig, **details)
         except OSError as error:
             raise LogError(f"the audit can't be written ({error.strerror or error})", where="audit",
-                           next_step="Nothing was changed. Free some disk space, or check that folder") from error
+                           next_step="Nothing was changed. Free some disk space, or check the folder"
+                           " of the service") from error

@@ -313,6 +313,8 @@ class TooManyRuns(TooManyTries):
 
 FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Numbers of the system's errors for a full disk and a used-up quota."""
+UNCHANGED: Final = "Nothing was "
+"""First words of a next step whose request had no effect: nothing was changed, signed or started."""
 
 
 class NoRoom(TdhilError):
@@ -324,12 +326,17 @@ class NoRoom(TdhilError):
 
 
 def disk_full(error: BaseException) -> NoRoom | None:
-    """Return the refusal for an error that a full disk caused, also as its cause; None for any other error."""
+    """Return the refusal for an error that a full disk caused, also as its cause; None for any other error.
+
+    A next step that begins with `UNCHANGED` is kept: it says that the refused request had no effect.
+    """
     for one in (error, error.__cause__):
         if isinstance(one, OSError) and one.errno in FULL and not isinstance(error, NoRoom):
             what, where = getattr(error, "what", ""), getattr(error, "where", "")
-            return NoRoom(what or f"the disk is full ({one.strerror})", where=where,
-                          next_step="Free some disk space, then repeat the request")
+            own = str(getattr(error, "next_step", ""))
+            return NoRoom(
+                what or f"the disk is full ({one.strerror})", where=where,
+                next_step=own if own.startswith(UNCHANGED) else "Free some disk space, then repeat the request")
     return None
 
 

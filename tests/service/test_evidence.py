@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from functools import partial
 
 import pytest
@@ -60,12 +62,14 @@ def test_a_private_text_is_refused_and_leaves_no_archive(call, service, run):
     assert not (service.store.place(run) / "evidence.zip").exists()
 
 
-def test_without_an_audit_entry_no_archive_is_made(call, service, run, monkeypatch):
-    def full(*said, **more):
-        raise OSError(28, "No space left on device")
+@pytest.mark.parametrize(("number", "status"), [(errno.ENOSPC, 507), (errno.EACCES, 503)])
+def test_without_an_audit_entry_no_archive_is_made(call, service, run, monkeypatch, number, status):
+    def unwritable(*said, **more):
+        raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(service.audit, "note", full)
-    call("POST", f"/runs/{run}/evidence", 503, json=STATED)
+    monkeypatch.setattr(service.audit, "note", unwritable)
+    error = call("POST", f"/runs/{run}/evidence", status, json=STATED)["error"]
+    assert error["next_step"].startswith("Nothing was changed.")
     assert not (service.store.place(run) / "evidence.zip").exists()
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
 import json
+import os
 from dataclasses import asdict, replace
 
 import pytest
@@ -84,15 +86,18 @@ def test_what_is_no_tag_is_refused(given):
         tags_of(given)
 
 
-def test_without_an_audit_entry_nothing_is_changed(call, service, monkeypatch):
+@pytest.mark.parametrize(("number", "status"), [(errno.ENOSPC, 507), (errno.EDQUOT, 507), (errno.EACCES, 503)])
+def test_without_an_audit_entry_nothing_is_changed(call, service, monkeypatch, number, status):
     run = ended(call, service)
 
-    def full(*said, **more):
-        raise OSError(28, "No space left on device")
+    def unwritable(*said, **more):
+        raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(service.audit, "note", full)
+    monkeypatch.setattr(service.audit, "note", unwritable)
     for path, sent in (("annotations", {"note": "x"}), ("archive", {"archived": True}), ("delete", {"confirm": run})):
-        assert "Nothing was changed" in call("POST", f"/runs/{run}/{path}", 503, json=sent)["error"]["message"]
+        error = call("POST", f"/runs/{run}/{path}", status, json=sent)["error"]
+        assert f"the audit can't be written ({os.strerror(number)})" in error["message"]
+        assert error["next_step"].startswith("Nothing was changed. Free some disk space")
     assert service.store.annotations(run) == Annotations()
     assert service.store.place(run).is_dir()
 
