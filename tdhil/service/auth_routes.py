@@ -13,7 +13,7 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import Principal, address_of, principal, set_cookies
 from tdhil.service.accounts import ROLES, AccountNameRefused, PasswordRefused, Token, User
 from tdhil.service.middleware import off
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_state import NotLoggedIn, TooManyTries, iso
 from tdhil.service.schemas import AccountsView, AccountView, MeView, TokenView, plain
 from tdhil.service.start_request import ValuesWrong
@@ -29,18 +29,9 @@ T = TypeVar("T")
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of logins, users and tokens."""
-    return [
-        api(site, me),
-        api(site, login),
-        api(site, logout),
-        api(site, password),
-        api(site, accounts),
-        api(site, add_user),
-        api(site, set_password),
-        api(site, remove_user),
-        api(site, add_token),
-        api(site, remove_token),
-    ]
+    return apis(
+        site, me, login, logout, password, accounts, add_user, set_password, remove_user, add_token,
+        remove_token)
 
 
 def _me_view(site: Site, who: Principal) -> MeView:

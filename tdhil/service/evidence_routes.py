@@ -13,7 +13,7 @@ from tdhil.service.access import principal
 from tdhil.service.evidence_request import ABOUT, ARCHIVE, EvidenceView, stated_in
 from tdhil.service.file_routes import file_of
 from tdhil.service.middleware import off
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_state import now
 from tdhil.service.store import write_json
 
@@ -31,7 +31,7 @@ _KEY_BYTES: Final = 32
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of evidence."""
-    return [api(site, make_evidence), api(site, evidence)]
+    return apis(site, make_evidence, evidence)
 
 
 async def make_evidence(site: Site, request: Request, body: Mapping[str, Any]) -> EvidenceView:

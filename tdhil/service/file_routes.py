@@ -13,7 +13,7 @@ from tdhil.service.acceptance_signature import FILE
 from tdhil.service.access import principal
 from tdhil.service.letterhead import outdated_reports
 from tdhil.service.middleware import off, whole_number
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_state import NotThere
 from tdhil.service.schemas import PictureView
 from tdhil.service.uploads import TRACE
@@ -32,16 +32,7 @@ PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of a run's files."""
-    return [
-        api(site, log),
-        api(site, report),
-        api(site, report_pdf),
-        api(site, result),
-        api(site, samples),
-        api(site, recording),
-        api(site, pictures),
-        api(site, picture),
-    ]
+    return apis(site, log, report, report_pdf, result, samples, recording, pictures, picture)
 
 
 async def log(site: Site, request: Request, body: None) -> Response:

@@ -10,7 +10,7 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import principal
 from tdhil.service.fleets import TABLE, FleetView
 from tdhil.service.middleware import off, whole_number
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_routes import settings_of
 from tdhil.service.schemas import FleetBody
 
@@ -23,15 +23,7 @@ if TYPE_CHECKING:
 
 def routes(site: Site) -> list[Route]:
     """Return the routes. ``fleet_folders`` comes before ``fleet``, since the path of ``fleet`` matches it, too."""
-    return [
-        api(site, fleets),
-        api(site, fleet_folders),
-        api(site, ask_fleet),
-        api(site, fleet),
-        api(site, stop_fleet),
-        api(site, fleet_rows),
-        api(site, fleet_table),
-    ]
+    return apis(site, fleets, fleet_folders, ask_fleet, fleet, stop_fleet, fleet_rows, fleet_table)
 
 
 async def fleet_folders(site: Site, request: Request, body: None) -> list[str]:

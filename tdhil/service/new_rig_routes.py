@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.service.access import principal
 from tdhil.service.middleware import off
 from tdhil.service.new_rig import draft_of, new_rig_view
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_state import Conflict
 from tdhil.service.schemas import DraftBody, DraftView, NewRigBody, NewRigView, RigView, ScanView, adapter
 from tdhil.service.start_request import ValuesWrong
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of a new rig."""
-    return [api(site, new_rig), api(site, draft_rig), api(site, scan_bus),
-            api(site, add_rig)]
+    return apis(site, new_rig, draft_rig, scan_bus, add_rig)
 
 
 async def new_rig(site: Site, request: Request, body: None) -> NewRigView:

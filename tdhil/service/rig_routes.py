@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_routes import archived_too
 from tdhil.service.run_state import Conflict, NotAllowed
 from tdhil.service.schemas import (
@@ -41,19 +41,7 @@ LARGEST_KG_M2: Final = 1e9
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of the rigs."""
-    return [
-        api(site, rigs),
-        api(site, rig),
-        api(site, rig_file),
-        api(site, edit_rig),
-        api(site, trend),
-        api(site, calibration),
-        api(site, plan),
-        api(site, pace),
-        api(site, start),
-        api(site, stop_rig),
-        api(site, faults),
-    ]
+    return apis(site, rigs, rig, rig_file, edit_rig, trend, calibration, plan, pace, start, stop_rig, faults)
 
 
 async def rigs(site: Site, request: Request, body: None) -> list[RigView]:

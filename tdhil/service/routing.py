@@ -54,3 +54,8 @@ def api(site: Site, handler: Handler, *, base: str = API) -> Route:
         return JSONResponse(plain(value, declared.answers[code]), code)
 
     return Route(f"{base}{declared.path}", serve, methods=[declared.method], name=name)
+
+
+def apis(site: Site, *handlers: Handler) -> list[Route]:
+    """Return the declared route of each handler, in this order."""
+    return [api(site, one) for one in handlers]

@@ -16,7 +16,7 @@ from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
 from tdhil.service.middleware import error_view, off, whole_number
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_filter import NEWEST, SORTS, Order, RunFilter
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
@@ -57,23 +57,9 @@ LAST_PAGE: Final = 100_000
 
 def routes(site: Site) -> list[Route]:
     """Return the routes. ``runs_page`` and ``compare`` come before ``run``, whose path matches theirs, too."""
-    return [
-        api(site, runs),
-        api(site, runs_page),
-        api(site, compare),
-        api(site, run),
-        api(site, confirm),
-        api(site, renew),
-        api(site, stop),
-        api(site, sign_off),
-        api(site, annotate),
-        api(site, archive),
-        api(site, delete_run),
-        api(site, acceptance),
-        api(site, sign_acceptance),
-        api(site, ask_replay),
-        api(site, replay),
-    ]
+    return apis(
+        site, runs, runs_page, compare, run, confirm, renew, stop, sign_off, annotate, archive, delete_run,
+        acceptance, sign_acceptance, ask_replay, replay)
 
 
 async def runs(site: Site, request: Request, body: None) -> list[Summary]:

@@ -15,7 +15,7 @@ from tdhil.recording import survey_trace
 from tdhil.service.access import principal
 from tdhil.service.door import ADMITTED, HEADERS_S
 from tdhil.service.middleware import error_view, fields_of, off
-from tdhil.service.routing import api
+from tdhil.service.routing import apis
 from tdhil.service.run_state import TooSlow
 from tdhil.service.schemas import PreviewView, UploadsView
 from tdhil.service.upload_request import RIG, columns_wrong, require_right, upload_options
@@ -39,14 +39,7 @@ POLL_S: Final = 0.5
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of uploads."""
-    return [
-        api(site, uploads),
-        api(site, upload),
-        api(site, one_upload),
-        api(site, preview),
-        api(site, identify_upload),
-        api(site, delete_upload),
-    ]
+    return apis(site, uploads, upload, one_upload, preview, identify_upload, delete_upload)
 
 
 async def uploads(site: Site, request: Request, body: None) -> UploadsView:
