@@ -96,11 +96,15 @@ def _key(path: Path | None) -> bytes:
 
 
 def _check(namespace: argparse.Namespace) -> int:
-    from tdhil.evidence import check_evidence
+    from tdhil.evidence import check_evidence, flag_of
 
     path: Path = namespace.check
     if namespace.log is not None or namespace.output is not None:
         raise UsageError("makes no archive, so it takes neither a log nor -o", where=_OF_THE_CHECK)
+    stated = [flag_of(one.name) for one in OF_EVIDENCE if getattr(namespace, one.name) is not None]
+    if given := [*stated, *(["--serial-key"] if namespace.serial_key is not None else [])]:
+        raise UsageError(f"has no effect with {_OF_THE_CHECK}, which makes no archive", where=" ".join(given),
+                         next_step="Nothing was checked. Leave it out")
     try:
         archive = path.read_bytes()
     except OSError as error:

@@ -112,11 +112,25 @@ def run(namespace: argparse.Namespace) -> int:
                  logs=namespace.logs, upload_limit=namespace.upload_limit * MEBIBYTE)
 
 
+def _refuse_of_serving(namespace: argparse.Namespace) -> None:
+    """Raise UsageError if options of the serving itself stand before users, tokens or audit: they have no effect."""
+    from tdhil.errors import UsageError
+
+    serving = argparse.ArgumentParser(allow_abbrev=False)
+    add_arguments(serving)
+    given = [f"--{name.replace('_', '-')}" for name, usual in vars(serving.parse_args([])).items()
+             if name not in ("data", "kind", "run") and getattr(namespace, name) != usual]
+    if given:
+        raise UsageError(f"has no effect with {namespace.kind}", where=" ".join(given),
+                         next_step="Nothing was done. Leave it out", entry=MessageCode.SERVICE_OPTION_WRONG)
+
+
 def run_accounts(namespace: argparse.Namespace) -> int:
     """Add, list or remove accounts, or set a password; a running service applies the change within a second."""
     from tdhil.errors import UsageError
     from tdhil.service import AccountsFile, require_folder
 
+    _refuse_of_serving(namespace)
     if namespace.action == "add":
         try:
             namespace.data.mkdir(parents=True, exist_ok=True, mode=0o750)
@@ -157,6 +171,7 @@ def run_audit(namespace: argparse.Namespace) -> int:
     from tdhil.errors import LogBroken
     from tdhil.service import Audit, ChainHead, require_folder
 
+    _refuse_of_serving(namespace)
     require_folder(namespace.data)
     audit = Audit(namespace.data.resolve() / "audit")
     kept = None if namespace.head is None else ChainHead.of(namespace.head)

@@ -49,6 +49,7 @@ def test_permission_is_never_assumed(log, tmp_path):
 
 @pytest.mark.parametrize(("words", "said"), [
     ((), "no log is named"), (("--check", "none.zip"), "can't be read"), (("none.mcap", *STATED), "does not exist"),
+    (("--check", "y.zip", "--publisher", "A", "--serial-key", "k"), "--publisher --serial-key: has no effect"),
     (("x.mcap", "--check", "y.zip"), "makes no archive"), (("x.mcap", "--sha256", "00"), "--sha256"),
 ])
 def test_wrong_use_is_said(words, said):

@@ -308,6 +308,10 @@ def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsy
     (["--check-idle", "--data", "d"], "--data d: this folder does not exist"),
     (["users", "list", "--data", "d"], "--data d: this folder does not exist"),
     (["users", "add", "anna", "--role", "admin", "--data", "file/d"], "--data file/d: can't be made"),
+    (["--port", "0", "--mqtt", "mqtt://a", "users", "add", "anna", "--role", "admin", "--data", "d"],
+     "--port --mqtt: has no effect with users"),
+    (["--tls-cert", "a.pem", "tokens", "list", "--data", "d"], "--tls-cert: has no effect with tokens"),
+    (["--check-idle", "audit", "--data", "d"], "--check-idle: has no effect with audit"),
 ])
 def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
@@ -318,7 +322,8 @@ def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, a
     locks.mkdir()
     locks.chmod(0o1777)
     monkeypatch.setattr("tdhil.session.drive_lock.FOLDERS", (str(locks),))
-    assert main(["serve", "--port", "0", *arguments]) == ExitCode.USAGE
+    serving = not {"users", "tokens", "audit"} & set(arguments)
+    assert main(["serve", *(["--port", "0"] if serving else []), *arguments]) == ExitCode.USAGE
     assert words in capsys.readouterr().err
     assert not (tmp_path / "d").exists()
 
