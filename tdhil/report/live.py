@@ -419,7 +419,7 @@ def _bar(one: LiveInertia, low: float, high: float) -> str:
 
 def _said(last: LiveInertia) -> str:
     """Return a line on the latest answer."""
-    parts = [f"{last.periods} periods"]
+    parts = [f"{last.periods} period{'' if last.periods == 1 else 's'}"]
     if last.p_value is not None:
         parts.append(f"p {last.p_value:.2g}")
     if last.inertia_kg_m2 is None:

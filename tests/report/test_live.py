@@ -263,6 +263,11 @@ def test_the_intervals_of_j_are_drawn_to_one_scale_in_80_columns():
     assert "at least 39 s to ±1 %" in drawn(answers(tolerance=0.01, least_left_s=39.0))[-1]
 
 
+def test_one_period_is_written_in_the_singular():
+    first = LiveInertia(60.0, 1, 0.95, "valid", "", 104.0, 100.0, 108.0, 100.0, 108.0)
+    assert "1 period, " in drawn([first])[-1]
+
+
 def test_without_a_number_the_reason_is_shown():
     unknown = LiveInertia(80.0, 2, 0.95, "not_identifiable", "too few periods")
     assert drawn([unknown]) == ["J is not known yet: too few periods"]

@@ -529,7 +529,7 @@
       const last = inertias[inertias.length - 1], known = inertias.filter((one) => one.inertia_kg_m2 !== null).pop();
       byId("inertia").hidden = !known;
       byId("inertia-now").textContent = known ? withUnit(interval(known.inertia_kg_m2, known.low_kg_m2, known.high_kg_m2)) : "–";
-      const words = [tr("{count} periods", { count: last.periods })];
+      const words = [last.periods === 1 ? tr("1 period") : tr("{count} periods", { count: last.periods })];
       if (known) words.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
       if (last.p_value !== null) words.push(`p = ${number(last.p_value, 2)}`);
       if (last.tolerance !== null && last.least_left_s !== null) words.push(tr("at least {time} to ±{share} %", { time: span(last.least_left_s), share: local(String(Number((100 * last.tolerance).toPrecision(3)))) }));

@@ -76,6 +76,13 @@ def test_the_last_value_is_the_one_of_the_result(page, served):
     assert page.evaluate("J => window.tdhil.ofResult({ inertia_kg_m2: J })", document) == now.inner_text()
 
 
+def test_one_period_is_written_in_the_singular(page, served):
+    run = played(served, LiveInertia(0.5, 1, 0.95, "not_identifiable", "the scatter stays open"))
+    page.goto(f"/runs/{run}/live")
+    page.locator("#inertia-said", has_text="the scatter stays open").wait_for()
+    assert page.locator("#inertia-said").inner_text() == "1 period, the scatter stays open"
+
+
 @pytest.mark.heavy
 def test_an_interval_without_a_number_says_why(page, served):
     run = played(served, LiveInertia(0.5, 2, 0.95, "not_identifiable", "2 periods leave the scatter open"))
