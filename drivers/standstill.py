@@ -86,7 +86,7 @@ class StandstillTest:
             f" {STANDSTILL_RAD_S:g} rad/s"
         )
         then = (
-            "There is no position to compare. Check by sight that the shaft is at rest" if self._position is None else
+            "There is no position to compare. Check by sight that the shaft stands still" if self._position is None else
             f"The position was compared, too: at most {STANDSTILL_ANGLE_RAD_S:g} rad/s"
         )
         return (f"{why}: tdhil accepted only a reported speed of zero. {then}",)

@@ -213,12 +213,12 @@ def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
     turning = abs(speed_rad_s) > still_rad_s
     found = f"{power.value}, status {status:04X}h" + (f", {speed_rad_s:.3g} rad/s" if turning else "")
     faulty = power in (PowerState.FAULT, PowerState.FAULT_REACTION)
-    mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
+    mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait for standstill of the shaft"
     where = f"{register_name(register)}, {register_name(cycle.speed.register_)}"
     known = power is not PowerState.UNKNOWN
     if not known:
         mend = "Check the drive behind a gateway, and that --profile is this drive's"
-    table.row("state", "no fault, at rest", found, known and not faulty and not turning, where, mend)
+    table.row("state", "no fault, standstill", found, known and not faulty and not turning, where, mend)
     if control.remote is not None:
         remote = seen(control.remote, status)
         table.row(

@@ -104,7 +104,7 @@ def said(report: BareStopReport) -> list[str]:
             lines.append(f"{when}: {seen.text}, {seen.speed:.3g} {seen.unit}")
     lines += [f"! {remark}" for remark in report.remarks]
     verdict = {
-        Ended.AT_REST: f"The shaft is at rest. {_holds(report)}",
+        Ended.AT_REST: f"The shaft is at standstill. {_holds(report)}",
         Ended.TURNING: f"Standstill was NOT observed. {NOT_CONFIRMED}",
         Ended.NO_ANSWER: f"NO ANSWER: it is unknown whether the shaft turns. {NOT_CONFIRMED}",
     }[report.ended]

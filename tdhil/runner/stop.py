@@ -493,7 +493,7 @@ class StopSequence:
         if abs(held_nm) <= 2.0 * self._string.residual_nm:
             return False
         self._trouble.append(
-            f"the drill string still holds {in_nm(held_nm)}: the drive was not disabled and holds the shaft at rest"
+            f"the drill string still holds {in_nm(held_nm)}: the drive was not disabled and holds the shaft"
         )
         return True
 
@@ -637,7 +637,7 @@ class StopSequence:
             )
         elif patience.waited_s:
             self._trouble.append(
-                f"the shaft was not seen at rest within {patience.waited_s:.1f} s of the quick stop"
+                f"standstill was not observed within {patience.waited_s:.1f} s of the quick stop"
             )
         return None
 

@@ -82,8 +82,8 @@ REQUIRED: Final[Mapping[int, RequiredReaction]] = {
     56: RequiredReaction("a free number from the start; QS in motion, however slow it is", (0, 5)),
     57: RequiredReaction("read back at once, QS", (5,)),
     58: RequiredReaction("read back, QS", (5,)),
-    59: RequiredReaction("that RPDO is off; QS, at rest", (5,)),
-    60: RequiredReaction("QS, at rest", (5,)),
+    59: RequiredReaction("that RPDO is off; QS, standstill", (5,)),
+    60: RequiredReaction("QS, standstill", (5,)),
     61: RequiredReaction("reported in log, in the result and at the end", (0,)),
     82: RequiredReaction("QS", (6,)),
     115: RequiredReaction(

@@ -65,7 +65,7 @@ def test_at_rest_the_cause_s_code(ends, cause):
     error, code = CAUSES[cause]
     got, out, err = ends(error, REST)
     assert (got, out) == (code, "")
-    assert str(error) in err and "the shaft is at rest (seen at 12.2 s) and the drive is disabled" in err
+    assert str(error) in err and "the shaft is at standstill (seen at 12.2 s) and the drive is disabled" in err
     assert "tdhil replay run.mcap" in err and "hard-wired" not in err
     assert ("ZeroDivisionError: ours" in err) is (cause == "mistake")      # where it is ours, with its traceback
 
@@ -78,7 +78,7 @@ def test_a_stop_that_nobody_saw_through_ends_with_8_whatever_came_before(ends, c
     assert "NOT confirmed: no feedback from the drive any more" in err
     assert "Use the hard-wired emergency stop now" in err
     assert error is None or str(error) in err
-    assert "at rest (seen" not in err and "nothing has moved" not in err
+    assert "at standstill (seen" not in err and "nothing has moved" not in err
 
 
 def test_before_motion_nothing_moved(ends):
@@ -86,7 +86,9 @@ def test_before_motion_nothing_moved(ends):
     assert got == 5 and "the drive was never enabled; nothing has moved" in err
 
 
-@pytest.mark.parametrize(("stop", "code", "said"), [(REST, 7, "at rest"), (TURNING, 8, "hard-wired emergency stop")])
+@pytest.mark.parametrize(("stop", "code", "said"), [
+    (REST, 7, "at standstill"), (TURNING, 8, "hard-wired emergency stop"),
+])
 def test_the_document_says_the_same(ends, stop, code, said):
     got, out, _ = ends(CAUSES["limit"][0], stop, ExitCode.OK, "--json")
     document = json.loads(out)
@@ -253,7 +255,7 @@ def test_a_burst_of_signals_up_to_the_very_end_changes_nothing(tmp_path):
         time.sleep(0.001)
     err = child.stderr.read()
     assert child.returncode == 130, err
-    assert "the shaft is at rest" in err
+    assert "the shaft is at standstill" in err
     assert read_run(log).complete
 
 

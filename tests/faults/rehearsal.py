@@ -74,7 +74,7 @@ class Rehearsed:
 
     def assert_nothing_moved(self):
         assert abs(self.shaft.speed_rad_s).max(initial=0.0) < 0.001
-        assert "nothing has moved" in self.done.err or "shaft is at rest" in self.done.err
+        assert "nothing has moved" in self.done.err or "shaft is at standstill" in self.done.err
 
     def assert_stopped(self, since_s, notice_s, *, held=True, backwards_rad_s=0.3):
         """Within the time to notice it, the ramp and the settling; never let go while it turned, but by the drive.

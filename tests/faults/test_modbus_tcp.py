@@ -193,6 +193,6 @@ def test_a_foreign_transaction_id_costs_a_sample_and_the_connection(bench, seen)
         out, err = bench.host.communicate(timeout=HANGS_S)
         assert relay.connections == 2
     assert bench.host.returncode == 143, err
-    assert "at rest" in json.loads(out)["stop"]
+    assert "at standstill" in json.loads(out)["stop"]
     bench.shaft.assert_never_let_go()
     seen(41, "the reply is dropped, the connection renewed, the run goes on", None, code=143)

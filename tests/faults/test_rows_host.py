@@ -29,7 +29,7 @@ def stopped_by_host(run, since_s, seen, row, code, *words):
     run.assert_ended(code, *words)
     standstill_s = run.assert_stopped(since_s, NOTICED_AT_ONCE_S)
     assert run.shaft.state[-1] == "switch on disabled"
-    assert "the shaft is at rest" in run.done.document["stop"]
+    assert "the shaft is at standstill" in run.done.document["stop"]
     seen(row, run.message, standstill_s, run.assert_log_whole(), code)
 
 

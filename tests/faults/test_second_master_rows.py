@@ -29,7 +29,7 @@ def test_noticed_and_stopped(row, fault, notice_s, words, rehearse, seen):
     run = rehearse("--fault", fault)
     run.assert_ended(5, *words)
     standstill_s = run.assert_stopped(run.fault_s, notice_s)
-    assert "at rest" in run.done.document["stop"]
+    assert "at standstill" in run.done.document["stop"]
     assert max(run.shaft.speed_rad_s[run.shaft.time_s >= run.fault_s]) < 10.0
     seen(row, f"`{fault}`: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
 

@@ -88,5 +88,5 @@ def test_a_log_that_is_taken_away(how, said, rehearse, monkeypatch, tmp_path, se
     run = rehearse()
     run.assert_ended(3, "can't be written any more", said, "run.mcap")
     standstill_s = run.assert_stopped(acted[0], 1.5)
-    assert "the shaft is at rest" in run.done.document["stop"]
+    assert "the shaft is at standstill" in run.done.document["stop"]
     seen(84, run.message.replace(str(tmp_path), "."), standstill_s, "gone", run.done.code)

@@ -246,7 +246,7 @@ def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
     assert done.code == 7
     assert "amplitude of 3 rad/s" in done.err
     assert "before anything moved" not in done.err
-    assert "the shaft is at rest" in done.document["stop"]
+    assert "the shaft is at standstill" in done.document["stop"]
     shaft = Shaft.read(trace)
     shaft.assert_enabled(True)
     shaft.assert_stopped_within_settings()

@@ -61,6 +61,6 @@ def test_stop_brings_a_drive_to_standstill_that_another_host_left_turning(tmp_pa
             running.child.wait()
         done = tdhil("stop", "--drive", "ethercat", *drive.options)
         assert done.code == 0, done.err
-        assert "at rest" in done.out + done.err
+        assert "at standstill" in done.out + done.err
         drive.shaft.assert_never_let_go()
         assert abs(drive.shaft.speed_rad_s[-1]) < 0.05

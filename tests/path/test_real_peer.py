@@ -203,7 +203,7 @@ def test_the_word_moves_the_shaft_and_the_prompt_fed_the_watchdog(prompt, drive)
     prompt.read_until("enabled, speed mode")          # stage speed, as the live display shows it
     prompt.type("\x03")
     assert prompt.finish() == 130
-    assert "the shaft is at rest" in prompt.plain
+    assert "the shaft is at standstill" in prompt.plain
     assert "SIMULATED" not in prompt.plain
     shaft = at_rest_after(drive)
     shaft.assert_enabled(True)

@@ -85,7 +85,7 @@ def test_a_drive_that_is_off_already_is_left_alone(turning):
     done = stop(drive)
     assert done.code == 0
     assert "switch on disabled" in done.out
-    assert "at rest" in done.out.splitlines()[-1]
+    assert "at standstill" in done.out.splitlines()[-1]
     assert drive.shaft.state[-1] == "switch on disabled"
 
 

@@ -37,7 +37,7 @@ def stopped(folder, generic, *arguments):
     assert done.document["error"]["code"] == "TDH-601"
     assert "stayed in torque mode" in done.document["error"]["message"]
     assert done.document["rehearsal"]["verdict"] == "pass"
-    assert "the shaft is at rest" in done.document["stop"]
+    assert "the shaft is at standstill" in done.document["stop"]
     shaft = Shaft.read(trace)
     shaft.assert_never_let_go()
     assert shaft.state[-1] == "switch on disabled"

@@ -31,7 +31,7 @@ def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, p
         tmp_path, "--simulate", "--seed", 3, "--plant", EXAMPLES / plant, "--rig", rig, "--trace", trace
     )
     assert done.code == 7, done.err                        # the time limit, while it turns
-    assert "the shaft is at rest" in done.document["stop"]
+    assert "the shaft is at standstill" in done.document["stop"]
     shaft = Shaft.read(trace)
     assert shaft.state[-1] == "switch on disabled"
     off = max(k for k, state in enumerate(shaft.state) if state in HELD)

@@ -85,7 +85,7 @@ def test_a_signal_in_each_stage(tmp_path, how, stage):
             shaft = drive.shaft
         assert done.code == INTERRUPTING[number], done.err
         assert "Traceback" not in done.err
-        assert "the shaft is at rest" in done.document["stop"]
+        assert "the shaft is at standstill" in done.document["stop"]
         shaft.assert_enabled(True)
         assert_stopped(shaft, done)
         if aborted_stage(done.log) == [stage]:

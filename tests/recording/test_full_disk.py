@@ -29,7 +29,7 @@ def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):
     said = json.loads(done.stdout)
     assert (done.returncode, said["exit_code"]) == (3, 3), done.stderr
     assert said["error"]["kind"] == "LogBroken"
-    assert "at rest" in said["stop"]
+    assert "at standstill" in said["stop"]
     assert "can't be written any more" in done.stderr
     assert "Traceback" not in done.stderr
     run = read_run(tmp_path / "run.mcap")

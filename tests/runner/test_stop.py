@@ -46,7 +46,7 @@ def test_one_witness_of_standstill_is_not_enough(world, what):
     report = here.stop_sequence().run()
     assert not report.confirmed
     assert not report.disabled
-    assert "not seen at rest" in report.trouble[-1]
+    assert "standstill was not observed" in report.trouble[-1]
     assert "disable" not in here.drive.calls
     assert here.drive.disabled_at == []
 

@@ -103,7 +103,8 @@ def test_a_shaft_is_read_from_a_trace(tmp_path):
 @pytest.mark.parametrize(("document", "said", "expected"), [
     ({"verdict": "valid", "inertia_kg_m2": {"low_total": 99.0, "high_total": 108.0}},
      "SIMULATED shaft at rest, drive\ndisabled", (True, None, "valid", 99.0, False)),
-    ({"error": {"message": "no feedback"}}, "tdhil: the shaft is at rest (seen at 13.4 s) and the drive is disabled",
+    ({"error": {"message": "no feedback"}},
+     "tdhil: the shaft is at standstill (seen at 13.4 s) and the drive is disabled",
      (True, 13.4, None, -np.inf, False)),
     ({}, "STOP NOT CONFIRMED: torque removed at 12.3 rad/s", (False, None, None, -np.inf, True)),
     (None, "", (False, None, None, -np.inf, False)),

@@ -42,7 +42,7 @@ def test_somebody_stops_the_node(tmp_path, vcan, tool):
         assert_safe(drive)
     assert_told(done, by_itself, 5)
     assert "NMT state stopped" in done.err
-    assert "at rest" in done.document["stop"] or "hard-wired emergency stop" in done.document["stop"]
+    assert "at standstill" in done.document["stop"] or "hard-wired emergency stop" in done.document["stop"]
 
 
 def test_a_second_station_under_the_drive_s_id(tmp_path, vcan, tool):
@@ -51,7 +51,7 @@ def test_a_second_station_under_the_drive_s_id(tmp_path, vcan, tool):
         assert_safe(drive)
     assert_told(done, by_itself, 5)
     assert "second master" in done.err
-    assert "the shaft is at rest" in done.document["stop"]
+    assert "the shaft is at standstill" in done.document["stop"]
 
 
 def test_a_second_master_sends_setpoints_and_syncs(tmp_path, vcan, tool):
@@ -146,7 +146,7 @@ def test_setpoints_alone_are_lost(tmp_path, vcan, tool, ip):
         assert "hard-wired emergency stop" in done.err
         assert shaft.events("host heartbeat lost")
     else:
-        assert "the shaft is at rest" in done.document["stop"]
+        assert "the shaft is at standstill" in done.document["stop"]
     assert shaft.state[-1] in ("quick stop active", "switch on disabled")
 
 
