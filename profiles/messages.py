@@ -27,12 +27,12 @@ class MessageCode(Enum):
     # --- 0xx: a result with a number, and its warnings ---------------------------------------------------------------
     VALID = (
         1, "The result is valid",
-        "One model fits the data, and the coverage interval is as narrow as requested.",
-        "Use the result. Calibrate the torque for a narrower total interval.")
+        "One model fits the data, and the half-width of its coverage interval is within --tolerance.",
+        "Use the result. A torque calibration makes the interval narrower.")
     VALID_WIDE = (
         2, "The result is valid, but its interval is wide",
-        "The coverage interval is wider than the requested tolerance.",
-        "Follow the advice beside the verdict, or accept a wider tolerance with --tolerance.")
+        "The half-width of the coverage interval, or of the repeatability, exceeds --tolerance.",
+        "Follow the advice beside the verdict, or raise --tolerance.")
     RESULT_WARNING = (
         20, "Warning about a result",
         "An assumption of the result needs attention.",
@@ -47,7 +47,7 @@ class MessageCode(Enum):
         "Read the filter settings in the drive, and enter them in the profile.")
     BARELY_CONSISTENT = (
         23, "The residuals are barely consistent with the model",
-        "The residual test almost rejects the model.",
+        "The p-value of the residual test is near its limit.",
         "Repeat the run with another motion, and compare both results.")
     LINES_TOO_WEAK = (
         24, "Some spectral lines are too weak",
@@ -59,7 +59,7 @@ class MessageCode(Enum):
         "Check the bus load and the log, and repeat the run.")
     SPEED_CHANGES_SIGN = (
         26, "The speed changes its sign",
-        "Coulomb friction reverses at standstill, which adds torque that is no inertia.",
+        "Coulomb friction reverses with the speed, and the model cannot separate this torque from inertia.",
         "Raise the mean speed with --offset, or lower --amplitude.")
     STALE_SAMPLES = (
         27, "Some samples repeat older values",
@@ -67,7 +67,7 @@ class MessageCode(Enum):
         "Lower --rate, or check the bus load.")
     SAMPLES_LEFT_OUT = (
         28, "Samples were left out",
-        "Some samples are no numbers, are spikes, or stay constant although the drive marked them as new.",
+        "Some samples are not numbers, are spikes, or stay constant although the drive marked them as new.",
         "Check the cable, the encoder and the drive's signal scaling.")
     PARTIAL_DATA = (
         29, "The log ended before the run",
@@ -83,7 +83,7 @@ class MessageCode(Enum):
         "Check the machine before you use the result.")
     FRICTION_NOT_LINEAR = (
         32, "Friction is not linear in speed",
-        "The friction torque bends over speed (Stribeck effect or a quadratic part); the model includes the bend.",
+        "The friction is nonlinear (Stribeck effect or a quadratic part), and the model includes this.",
         "Use the friction value only near the mean speeds of the run.")
     FRICTION_DRIFTS = (
         33, "Friction drifts during the run",
@@ -123,7 +123,7 @@ class MessageCode(Enum):
         "Add a lower frequency with --frequency.")
     LOAD_SWINGS_WIDELY = (
         42, "The load oscillates differently at each mean speed",
-        "The load oscillates so widely that friction changes its response.",
+        "The load oscillates with a large amplitude, and friction changes its response.",
         "Lower --amplitude, or raise the mean speed.")
     OTHER_PIPE = (
         43, "The string is not the declared pipe",
@@ -218,7 +218,7 @@ class MessageCode(Enum):
 
     # --- 2xx: use, files, configuration ------------------------------------------------------------------------------
     USAGE = (
-        200, "The command is not possible as written",
+        200, "The command cannot run as written",
         "An option or a value is wrong, or two options exclude each other.",
         "Correct what the message names. The option --help of the command lists all options.")
     UNKNOWN_COMMAND = (
@@ -271,12 +271,12 @@ class MessageCode(Enum):
         "Leave --drive out, or choose a profile of this bus.")
     OPTION_OF_ANOTHER_BUS = (
         213, "The option belongs to another bus",
-        "An option of CAN or Modbus was given for a drive on the other bus.",
+        "The drive is on another bus than the one that the option is for.",
         "Leave the option out, or change --drive.")
     BUS_NOT_CONFIGURED = (
         214, "No bus is configured",
         "The command needs a drive, and no interface, channel, serial line or address is given.",
-        "State where the drive is, with -i and -c for CAN, or --tcp or --serial for Modbus.")
+        "Give the address of the drive with -i and -c (CANopen), -i (EtherCAT), or --host or --serial (Modbus).")
     BUS_OPTIONS_WRONG = (
         215, "The options of the bus are not valid",
         "python-can does not know the interface, or refuses one of its options.",
@@ -302,9 +302,9 @@ class MessageCode(Enum):
         "A log of tdhil states this value itself.",
         "Leave the option out.")
     CSV_COLUMNS_UNCLEAR = (
-        221, "A column of the CSV trace is not clear",
+        221, "A column of the CSV trace is not identified",
         "A column for time, speed or torque is missing, has no known unit, or several columns match.",
-        "Name the columns, such as --columns time=t:ms,speed=n:rpm,torque=M.")
+        "Give name and unit of each column, such as --columns time=t:ms speed=n:rpm torque=M:Nm.")
     RATED_TORQUE_MISSING = (
         222, "The rated torque is not given",
         "The trace states torque as a share of the rated torque.",
@@ -336,7 +336,7 @@ class MessageCode(Enum):
     STUDY_SETTING_WRONG = (
         229, "A setting of a study is not valid",
         "The study, a section or a name is unknown, or the value is not allowed.",
-        "List the settings with tdhil study NAME --help.")
+        "Correct what the message names. tdhil study list shows the studies.")
     SERVICE_OPTION_WRONG = (
         230, "An option of the service is not valid",
         "An address, a host name, a certificate or a broker is not usable as written.",
@@ -471,7 +471,7 @@ class MessageCode(Enum):
         "Check the noise and the scale of the speed signal.")
     BRAKING_UNCLEAR = (
         416, "The drive does not brake as commanded",
-        "A negative torque did not slow the shaft down.",
+        "A negative torque setpoint did not decelerate the shaft.",
         "Check the sign of the torque setpoint, and whether the drive can brake.")
     PREFLIGHT_TABLE = (
         417, "A setting of the drive is not as required",
@@ -480,7 +480,7 @@ class MessageCode(Enum):
     DRIVE_LIMIT_TIGHTER = (
         418, "A limit in the drive is narrower than the run needs",
         "The drive's own limit would clip the motion.",
-        "Lower the motion, or allow the change with --accept-wider-limit.")
+        "Request less motion, or allow the change with --accept-wider-limit.")
     NO_TORQUE_MODE = (
         419, "The drive has no usable torque mode",
         "The drive has no torque mode, or cannot enter it while it turns.",
@@ -550,9 +550,9 @@ class MessageCode(Enum):
         "Another run has the rig, or the run is in another state.",
         "Wait for the other run, or sign off its stop.")
     CODE_REFUSED = (
-        436, "The confirmation of a person at the shaft failed",
-        "The code is wrong, used or expired, or the confirming page is closed.",
-        "Request the run again, and enter the new code at the rig.")
+        436, "The operator at the rig did not confirm the run",
+        "The code is wrong, used or expired, or the page that confirmed the run is closed.",
+        "Request the run again. Enter the new code, which tdhil serve or tdhil attend shows at the rig.")
     CHANGED_MEANWHILE = (
         437, "A file changed after the request",
         "The rig file or the profile is not the one that was confirmed.",
@@ -674,7 +674,7 @@ class MessageCode(Enum):
     LIMIT_HIT = (
         700, "A limit was reached",
         "A limit of rig.yaml was reached, and the shaft was stopped.",
-        "Lower the motion, or widen the limit if the machine allows it.")
+        "Request less motion, or widen the limit if the machine allows it.")
     SPEED_LIMIT = (
         701, "The speed left its window",
         "The speed left, or was about to leave, the window in rig.yaml.",
@@ -697,7 +697,7 @@ class MessageCode(Enum):
         "Check the load, the friction and the drive's speed loop.")
     STICK_SLIP = (
         706, "The drill string sticks and slips",
-        "The string oscillates at this speed, and a softer control does not end it.",
+        "The string oscillates at this speed, and a softer speed control does not end it.",
         "Raise the speed.")
     NO_ROOM_FOR_MOTION = (
         707, "No motion of stage 5 fits the limits",
@@ -808,7 +808,7 @@ class MessageCode(Enum):
         "Within a tenth of a second it changed by more than torque and string can do to this shaft.",
         "Check the encoder, its cable and its scale. Repeat the run.")
     SEVERITY_REFUSED = (
-        925, "The record says nothing of the string's torsional motion",
+        925, "The record does not show the string's torsional motion",
         "The record is too short or too slow, has too many gaps, or the string does not turn in it.",
         "Name a longer record of rotation, with at least sixteen samples in each period of the string.")
 
@@ -844,7 +844,7 @@ class MessageCode(Enum):
     ACCEPTANCE_FAILED = (
         1201, "An identified value contradicts the expected one",
         "The interval of the identified value and the tolerance of the expected one have no value in common.",
-        "Find what is off on the card. Correct the machine, or the expected value in rig.yaml.")
+        "Compare each row of the card. Correct the machine, or the expected value in rig.yaml.")
     EVIDENCE_FAILED = (
         1202, "An archive of evidence did not pass its check",
         "The archive was changed, is incomplete, contains a private text, or its result does not follow from its log.",

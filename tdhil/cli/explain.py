@@ -15,27 +15,27 @@ from tdhil.errors import UsageError
 
 GROUPS: Final = {
     0: ("Results", "0", "A result with a number, and the warnings beside it."),
-    1: ("Internal errors", "1", "A mistake of tdhil, or a lack of memory, disk space or processes."),
-    2: ("Use, files and configuration", "2", "The command, a file or a setting is not usable as it is."),
-    3: ("Partial results", "3", "Something was lost at the end; the recorded part can be used."),
-    4: ("Refused before motion", "4", "A check failed before the shaft moved."),
-    5: ("Communication", "5", "The drive, the bus or a server was not reached, or was lost."),
-    6: ("Drive", "6", "The drive reported a fault, or its reports cannot be true."),
-    7: ("Limits", "7", "A limit was reached in motion, and the shaft was stopped."),
+    1: ("Internal errors", "1", "A defect of tdhil, or too little memory, disk space or processes."),
+    2: ("Use, files and configuration", "2", "The command, a file or a setting has an error."),
+    3: ("Partial results", "3", "The log, the output or the audit is incomplete. The recorded part is usable."),
+    4: ("Refused before motion", "4", "A check before motion failed, and the run did not start."),
+    5: ("Communication", "5", "The connection to the drive, the bus or a server failed."),
+    6: ("Drive", "6", "The drive reported a fault, or its signals contradict each other."),
+    7: ("Limits", "7", "A limit was reached in motion, and tdhil stopped the shaft."),
     8: ("Stop not confirmed", "8", "The shaft may still turn. Use the hard-wired emergency stop."),
     9: ("Not identifiable", "9", "The data do not determine the inertia, or contradict the model."),
-    10: ("Unreadable files", "10", "A file holds nothing that can be used."),
+    10: ("Unreadable files", "10", "A file contains no usable data."),
     11: ("Tuning refused", "11", "The requested gains are not recommended."),
-    12: ("Not passed", "12", "A rehearsal, an acceptance or an archive of evidence did not pass."),
+    12: ("Not passed", "12", "A rehearsal, an acceptance or an archive of evidence failed its check."),
     13: ("Interrupted", "130 and above", "Ctrl-C or another signal ended the program."),
 }
 """Title, exit code and one sentence of each group of codes."""
 
 _HEAD: Final = """# Messages
 
-Each error, refusal, verdict and warning of tdhil has a code that stays the same in all versions. The code stands in
-brackets behind the text, and under the key `code` in JSON and in the API. `tdhil explain TDH-412` shows its entry
-without a network.
+Each error, refusal, verdict and warning of tdhil has a code that stays the same in all versions. The code follows
+the text in brackets. In JSON and in the API it has the key `code`. `tdhil explain TDH-412` shows its cause and cure
+offline.
 
 The hundreds of a code are the exit code of the process. This page is made from the code by
 `tdhil explain --markdown`.
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `tdhil explain`."""
     parser.add_argument("code", nargs="?", metavar="TDH-nnn", help="a code, such as TDH-412 (default: list all)")
     add_option(parser, OPTION["json"])
-    parser.add_argument("--markdown", action="store_true", help="the page docs/reference/messages.md on stdout")
+    parser.add_argument("--markdown", action="store_true", help="print the page docs/reference/messages.md")
     parser.set_defaults(run=run)
 
 

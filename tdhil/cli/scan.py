@@ -68,7 +68,7 @@ def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> 
         print_json({"found": [asdict(one) for one in found], "remarks": remarks})
         return
     for one in found:
-        print(visible(f"{one.name}: {one.title or 'without a name'}{' · SIMULATED' if one.simulated else ''}"))  # noqa: T201
+        print(visible(f"{one.name}: {one.title or 'no device name'}{' · SIMULATED' if one.simulated else ''}"))  # noqa: T201
         for name, text in (
             ("identity", one.identity),
             ("profile", f"{one.profile or 'none'} ({one.why})"),
@@ -106,7 +106,7 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
         one = replace(one, profile=options.profile, why=f"as given: {options.source('profile')}")
     profile = load_profile(one.profile) if one.profile is not None else None
     write_new(path, starter(one, connection.bus.rig_section(one, connection), profile))
-    print(f"{path}: written. Fill in its limits: until then a real drive does not move", file=sys.stderr)  # noqa: T201
+    print(f"{path} was written. Fill in its limits: a real drive does not move without them", file=sys.stderr)  # noqa: T201
 
 
 def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
@@ -116,6 +116,6 @@ def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunO
         drives = [one for one in drives if one.profile is not None] or drives
     if len(drives) == 1:
         return drives[0]
-    what = f"{len(drives)} drives were found" if drives else f"number {named} did not answer"
-    raise UsageError(f"{what}, but a rig.yaml is for one drive", where="--write",
+    what = f"{len(drives)} drives were found" if drives else f"no drive with the number {named} answered"
+    raise UsageError(f"{what}; a rig.yaml describes one drive", where="--write",
                      next_step=f"Select it with {connection.bus.address_flag}")

@@ -293,10 +293,11 @@ class RunOptions:
         "--tolerance", "run.tolerance", 0.05, group=Topic.RESULT, common=True, unit=SHARE, metavar="SHARE", api=True,
         gt=0, lt=1,
         form=Form("Tolerance: half-width of the interval, ± % of J", ("run", "replay", "upload"), PERCENT),
-        asked_again="requested half-width of the interval",
-        help="acquire until the half-width of the interval is this share of J, such as 1% or 0.01",
-        more="requested half-width of the interval, as a share of J (`0.01`; on the command line `1%` too); a wider "
-             "interval is `valid_wide`. If it is given, stage 5 continues until the interval is this narrow",
+        asked_again="largest half-width of a valid result",
+        help="acquire until the half-width of the repeatability is this share of J, such as 1% or 0.01",
+        more="largest half-width, as a share of J (`0.01`; on the command line `1%` too). If it is given, stage 5 "
+             "continues until the repeatability is this narrow. The verdict is `valid_wide` if the repeatability, or "
+             "the whole interval with the torque scale, is wider",
     )
     max_time_s: float | None = option(
         "--max-time", "run.max_time_s", group=Topic.MOTION, common=True, unit=TIME, metavar="TIME", api=True, ge=1e-6,

@@ -60,7 +60,7 @@ def confirm_motion(
             entry=MessageCode.NOT_CONFIRMED,
         )
     _forget_what_was_typed()
-    console.print(f"Type {WORD} and Enter to turn the shaft, anything else to leave it alone: ", end="")
+    console.print(f"Type {WORD} and Enter to turn the shaft, anything else to cancel: ", end="")
     if _ask(idle).strip() != WORD:
         raise PreflightRefused("the motion was not confirmed", where="prompt", next_step="Nothing has moved",
                                entry=MessageCode.NOT_CONFIRMED)
@@ -136,7 +136,7 @@ def confirm_mounted(console: Console, later: str) -> None:
         "  [ ] switch the drive off and lock it out\n"
         "  [ ] bolt the body tight to the motor shaft; change nothing else (drive, filters, gear)\n"
         "  [ ] take tools off the shaft, clear it of people, and switch the drive on again", markup=False)
-    console.print(f"Type {MOUNTED} and Enter when the body is mounted, anything else to end here: ", end="")
+    console.print(f"Type {MOUNTED} and Enter when the body is mounted, anything else to cancel: ", end="")
     if _line().strip() != MOUNTED:
         raise PreflightRefused(
             "the body was not confirmed as mounted; the second run was not started", where="prompt",

@@ -206,7 +206,7 @@ def _open(path: Path) -> int:
                 with suppress(OSError):
                     os.fchmod(descriptor, 0o666)   # regardless of the first user's umask
                 return descriptor
-        raise FileNotFoundError(errno.ENOENT, "the file appears and disappears", str(path))
+        raise FileNotFoundError(errno.ENOENT, "another process creates and removes the file repeatedly", str(path))
     except OSError as error:
         raise _no_lock(error, path) from error
 

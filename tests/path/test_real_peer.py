@@ -156,7 +156,7 @@ def test_yes_replaces_the_prompt(tmp_path, drive, rig):
 def prompt(tmp_path, drive, rig):
     """The run on a terminal, standing at the prompt."""
     with Terminal(sys.executable, "-m", "tdhil", "identify", *drive.options, "--rig", rig, cwd=tmp_path) as terminal:
-        assert terminal.read_until("anything else to leave it alone:"), terminal.plain
+        assert terminal.read_until("anything else to cancel:"), terminal.plain
         yield terminal
 
 

@@ -220,7 +220,7 @@ def test_a_file_that_comes_and_goes_and_a_system_without_locks_are_no_motion(por
 
     with monkeypatch.context() as changed:
         changed.setattr(os, "open", comes_and_goes)
-        with pytest.raises(PreflightRefused, match="the file appears and disappears"), hold(at):
+        with pytest.raises(PreflightRefused, match="another process creates and removes the file"), hold(at):
             pass
 
     def no_locks(descriptor, what):

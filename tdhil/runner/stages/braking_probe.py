@@ -184,7 +184,7 @@ def plan_pulse(
     if change_nm < STRING_CLEAR * before.swing_nm:
         return NoPulse(
             f"the string's oscillation of ±{before.swing_nm:.3g} N·m would hide the effect of {change_nm:.3g} N·m",
-            "Use --mode speed, or let the string come to rest: lift the bit off bottom, or reduce the weight on bit",
+            "Use --mode speed, or bring the string to standstill: lift the bit off bottom, or reduce the weight on bit",
         )
     if slowing < CLEAR_WANDER * before.wander_rad_s:
         return NoPulse(
