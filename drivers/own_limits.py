@@ -38,9 +38,10 @@ class OwnLimits:
     ) -> None:
         """Add the row of a limit that stays."""
         self.kept[limit] = min(abs(found_si), self.kept.get(limit, abs(found_si)))
-        effect = "it brakes harder" if limit == QUICK_STOP else "the run keeps within it"
+        effect = "the drive brakes harder" if limit == QUICK_STOP else "the run keeps within it"
         text = f"{found}, kept: tighter than rig.yaml's, {effect}"
-        table.checks.append(Check(title, wanted, text, Outcome.NOTE, where, f"{WIDER_FLAG} {limit} sets rig.yaml's"))
+        hint = f"To set the limit of rig.yaml, add {WIDER_FLAG} {limit}"
+        table.checks.append(Check(title, wanted, text, Outcome.NOTE, where, hint))
 
     def written(
         self, table: PreflightTable, limit: str, title: str, wanted: str, now: str, before: str, good: bool, where: str,

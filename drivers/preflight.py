@@ -48,14 +48,14 @@ class PreflightTable:
 NO_WATCHDOG_FLAG = "--accept-no-watchdog"
 SHARED_FLAG = "--accept-shared-watchdog"
 ANY_CLIENT = (
-    "any other client's requests feed it, too: while one goes on asking, the drive will not stop by itself if this"
-    " computer, the program or the cable fails"
+    "requests of any client feed it: while another client continues to send them, the drive will not stop by itself"
+    " if this computer, the program or the cable fails"
 )
-DIES = "Without it a host that dies would leave the shaft turning"
+DIES = "Without it the shaft keeps turning if the host fails"
 NOTHING_STOPS_IT = "the drive will not stop by itself if this computer, the program or the cable fails"
 ACCEPTED_BY = f"accepted by {NO_WATCHDOG_FLAG}"
-_HINT = f"A drive whose watchdog is off, and can't be armed, is taken by name only: {NO_WATCHDOG_FLAG}"
-_NOT_OFF = f"{NO_WATCHDOG_FLAG} takes a watchdog that is off, not one that is set otherwise"
+_HINT = f"If the watchdog is off and cannot be armed, a run needs {NO_WATCHDOG_FLAG}"
+_NOT_OFF = f"{NO_WATCHDOG_FLAG} accepts a watchdog that is off, not one with another setting"
 
 
 def settle(table: PreflightTable, tried: PreflightTable, accepted: bool, is_off: Callable[[], bool]) -> bool:
@@ -124,7 +124,7 @@ def agreed_rated_torque(table: PreflightTable, from_drive_nm: float | None, rig_
     rated_nm = rig_nm if rig_nm is not None else from_drive_nm
     if rated_nm is None:
         table.row(
-            "rated torque", "known", "the drive does not tell", False, where,
+            "rated torque", "known", "not reported by the drive", False, where,
             "Give drive_data.rated_torque_nm in rig.yaml (motor name plate)",
         )
     elif from_drive_nm is None:
@@ -133,6 +133,6 @@ def agreed_rated_torque(table: PreflightTable, from_drive_nm: float | None, rig_
         agree = abs(from_drive_nm - rated_nm) <= 0.001 * rated_nm
         table.row(
             "rated torque", f"{rated_nm:g} N·m", f"{from_drive_nm:g} N·m", agree, where,
-            "rig.yaml and the drive disagree, and every torque is scaled by it: find out which is right",
+            "rig.yaml and the drive state different values, and this value scales every torque. Correct the wrong one",
         )
     return rated_nm

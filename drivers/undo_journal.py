@@ -35,7 +35,7 @@ class Change:
     def text(self) -> str:
         """Text for messages: 6072h was left at 400, and was 100 before."""
         now, then = (int.from_bytes(data, "little") for data in (self.after, self.before))
-        return f"{self.where} was left at {now}, and was {then} before"
+        return f"{self.where} was left at {now}; before that run it was {then}"
 
 
 class UndoJournal:
@@ -95,8 +95,8 @@ class UndoJournal:
             scratch.replace(self._path)
         except OSError as error:
             raise PreflightRefused(
-                f"what the run changes in the drive can't be written down: {error}", where=str(self._path),
-                next_step="Give the log a folder that can be written to, with --log",
+                f"the file with the former settings of the drive can't be written: {error}", where=str(self._path),
+                next_step="Name a writable folder with --log",
                 entry=MessageCode.UNDO_FILE_PROBLEM,
             ) from error
 
@@ -112,7 +112,7 @@ def read(path: Path) -> tuple[str, tuple[Change, ...]]:
         return str(document["drive"]), entries
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise PreflightRefused(
-            f"what a run left in a drive can't be read: {error}", where=str(path),
+            f"the file with the former settings of the drive can't be read: {error}", where=str(path),
             next_step="Compare the drive's settings with its documents, and remove the file",
             entry=MessageCode.UNDO_FILE_PROBLEM,
         ) from error

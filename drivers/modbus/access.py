@@ -137,6 +137,6 @@ class RegisterAccess:
             except RegisterRefused as error:
                 failed.append(str(error))
             except CommunicationLost as error:
-                failed.append(f"{error} ({len(self._undo)} more settings were not given back)")
+                failed.append(f"{error} ({len(self._undo)} more settings were not restored)")
                 self._undo.clear()
         return tuple(failed)

@@ -153,9 +153,9 @@ def spans(registers: Iterable[Register], gap: int, most: int) -> list[RegisterSp
     for register in sorted(registers, key=lambda one: (one.table, one.address, one.count)):
         if register.count > most:
             raise PreflightRefused(
-                f"a 32-bit number in register {register.address} can't be sent or read in one piece",
+                f"a 32-bit number in register {register.address} can't be transferred in one request",
                 where="profile, cycle.functions",
-                next_step="Its two halves would act one after the other; the drive needs function 16 or 23 for it",
+                next_step="The drive would apply its halves one after the other. Function 16 or 23 is needed",
                 entry=MessageCode.MODBUS_FUNCTIONS_MISSING,
             )
         end = register.address + register.count
@@ -208,7 +208,7 @@ def _unable(verb: str, span: RegisterSpan) -> PreflightRefused:
     return PreflightRefused(
         f"register {span.address} can't be {verb}: the profile names no function for it",
         where="profile, cycle.functions",
-        next_step="Say there which function codes the drive knows: 3 reads, 6, 16 or 23 write",
+        next_step="List the function codes of the drive there: 3 reads; 6, 16 and 23 write",
         entry=MessageCode.MODBUS_FUNCTIONS_MISSING,
     )
 

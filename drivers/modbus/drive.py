@@ -294,9 +294,9 @@ class ModbusDrive:
         """
         if self._other.seen and not self._profile.watchdog.fed_by_us_alone:
             raise CommandRejected(
-                "the other master feeds the drive's watchdog, too, so silence would not make it act: the quick stop is"
-                " repeated as fast as the line carries it", where=self._where,
-                next_step="Use the hard-wired emergency stop, and take the other master off the drive",
+                "the other master also feeds the drive's watchdog, so the watchdog would not act if tdhil fell silent. "
+                "tdhil repeats the quick stop as fast as the line allows", where=self._where,
+                next_step="Use the hard-wired emergency stop, and disconnect the other master",
             )
         if self._silent_since_s is None:
             self._silent_since_s = self.clock.now_s()
@@ -591,7 +591,7 @@ class ModbusDrive:
                 raise DriveFault(
                     f"the drive went into {power.value}, status {self._feedback.status:04X}h",
                     where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
-                    next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
+                    next_step="See the drive's fault list, remove the cause, then start with --reset-fault",
                 )
         elif self._wish is not PowerRequest.ENABLED:
             out, self._out_of_operation = self._out_of_operation, self._out_of_operation + 1
@@ -605,7 +605,7 @@ class ModbusDrive:
                         f"the drive is enabled, but this run does not request it (status"
                         f" {self._feedback.status:04X}h): another master commands it",
                         where=f"{self._where}, {register_name(self._profile.cycle.control.register_)}",
-                        next_step="Take the other master off the drive (PLC, panel, gateway)",
+                        next_step="Disconnect the other master (PLC, panel, gateway)",
                         entry=MessageCode.FOREIGN_MASTER,
                     )
         elif self._wish is PowerRequest.ENABLED:
@@ -626,7 +626,7 @@ class ModbusDrive:
             raise CommunicationLost(
                 f"the bus no longer controls the drive: its status {status:04X}h does not show remote control",
                 where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
-                next_step="Was the drive switched to its panel or another source? Give control back, and start anew",
+                next_step="Return control to the bus at the panel or command source of the drive, and start again",
                 entry=MessageCode.FOREIGN_MASTER,
             )
 
@@ -666,7 +666,7 @@ class ModbusDrive:
                 left = self._access.restore()
             else:
                 left = tuple(
-                    f"{where}: the drive is not known to be disabled, so what stood there before was not given back"
+                    f"{where}: it is not confirmed that the drive is disabled, so the former value was not restored"
                     for where in self._access.changed
                 )
         except CommunicationLost as error:

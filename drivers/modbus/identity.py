@@ -76,9 +76,9 @@ def refuse_if_driven(access: RegisterAccess, profile: ModbusProfile, where: str)
         ) from error
     if power_state(decode(profile.control, status)) is PowerState.ENABLED:
         raise PreflightRefused(
-            f"the drive is enabled already (status {status:04X}h): another master drives it",
+            f"the drive is enabled already (status {status:04X}h): another master commands it",
             where=where,
-            next_step="Take that master off the bus, or disable the drive there; nothing was written to it",
+            next_step="Disconnect that master, or disable the drive there. Nothing was written to the drive",
             entry=MessageCode.ANOTHER_MASTER,
         )
 
@@ -90,6 +90,6 @@ def refuse_unless_stepped(marker: Marker) -> None:
         raise PreflightRefused(
             f"stepped time was requested, but the peer {what}",
             where=f"register {MARKER_REGISTER}",
-            next_step="Leave --stepped out: a real shaft moves in real time",
+            next_step="Remove --stepped: a real shaft moves in real time",
             entry=MessageCode.NOT_THE_SIMULATOR,
         )

@@ -32,7 +32,7 @@ GOLDEN = 0.6180339887498949
 """Golden ratio: it spreads the checks, so that they never stay in step with another master's writes."""
 ROOM = 0.8
 """Share of the period that a cycle with a check may take."""
-_TAKE_OFF = "Take the other master off the drive (PLC, panel, commissioning tool, gateway)"
+_TAKE_OFF = "Disconnect the other master (PLC, panel, commissioning tool, gateway)"
 
 
 class _WrittenRegister(NamedTuple):

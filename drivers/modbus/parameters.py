@@ -59,14 +59,14 @@ def read_parameters(
         elif parameter.name not in values and parameter.register_ is None and needed(profile, parameter):
             table.row(
                 parameter.title, "known", "can't be read over the bus", False, parameter.name,
-                f"Give drive_data.parameters.{parameter.name} in rig.yaml, as it stands on the drive's panel",
+                f"Give drive_data.parameters.{parameter.name} in rig.yaml, as the drive's panel shows it",
             )
         elif parameter.name in given and parameter.name in counts and not _close(
             values.get(parameter.name, math.nan), given[parameter.name], _lsb(parameter, values)
         ):
             table.row(
                 parameter.title, show(given[parameter.name], parameter), show(values[parameter.name], parameter), False,
-                where_of(parameter), "rig.yaml and the drive disagree: find out which is right",
+                where_of(parameter), "rig.yaml and the drive state different values: correct the wrong one",
             )
     return Parameters(counts, values)
 
@@ -265,9 +265,9 @@ def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusPro
             write_setting(table, access, parameter, limits, rated_nm, found.values)
     for kind, title in (("speed_limit", "speed limit"), ("torque_limit", "torque limit")):
         if kind not in kinds:
-            text = "the drive's own can't be set over the bus: set it by hand"
+            text = "tdhil cannot set it over the bus: set it at the drive"
             if kind == "torque_limit":
-                text += "; only the guard and the setpoint hold it"
+                text += "; only guard and setpoint of the host limit torque"
             table.note(title, text, "profile")
 
 
@@ -304,7 +304,7 @@ def _write_limit(
     if not parameter.writable_in_operation:
         write_setting(table, access, parameter, limits, rated_nm, values)
         return
-    mend = parameter.advice or "The drive took the value but didn't keep it: is it locked, or its range narrower?"
+    mend = parameter.advice or "The drive did not keep the value. Check whether it is locked or its range is narrower"
     try:
         back = access.change(register, setting.counts)
     except PreflightRefused as error:
@@ -343,14 +343,14 @@ def write_setting(
     wanted = show(counts * lsb, parameter)
     if not parameter.writable_in_operation:
         back = access.read(register)
-        advice = parameter.advice or f"Set '{parameter.title}' at the drive; it takes effect after a restart only"
+        advice = parameter.advice or f"Set '{parameter.title}' at the drive, and restart the drive"
         return table.row(parameter.title, wanted, show(back * lsb, parameter), back == counts, where, advice)
 
     def work() -> tuple[str, bool]:
         back = access.change(register, counts)
         return show(back * lsb, parameter), back == counts
 
-    advice = parameter.advice or "The drive took the value but didn't keep it: is it locked, or its range narrower?"
+    advice = parameter.advice or "The drive did not keep the value. Check whether it is locked or its range is narrower"
     return table.attempt(parameter.title, wanted, where, work, advice)
 
 
@@ -388,7 +388,7 @@ def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float,
     if counts < 1 and _LIMIT.get(kind or "") == TORQUE:        # one count would be a wider limit than requested
         raise CommandRejected(
             f"{show(value, parameter)} is less than one count, {show(lsb, parameter)}", where=where,
-            next_step="The drive can't hold so low a limit: is its scale right, and the limit in rig.yaml?",
+            next_step="The drive cannot represent so low a limit. Check its scale, and the limit in rig.yaml",
         )
     # A limit of zero counts would switch it off on many drives.
     return RegisterSetting(int(sign) * max(1, counts), lsb)

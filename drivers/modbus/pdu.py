@@ -44,11 +44,11 @@ EXCEPTION_NAMES = {
 }
 
 _STEPS = {
-    1: "The drive doesn't know this function: take it out of cycle.functions in the profile",
+    1: "The drive does not have this function: remove it from cycle.functions in the profile",
     2: "Count addresses from 0 (a manual's 40001 is 0); check the profile's address and the drive's model",
-    3: "The drive takes no such value or number of registers: check scale and limits in the profile",
-    4: "The drive failed while it worked on this: look at its own panel for a fault",
-    6: "The drive is busy: wait, is a commissioning tool connected? Then start anew",
+    3: "The drive does not accept this value or number of registers: check scale and limits in the profile",
+    4: "The drive failed to process the request: check its panel for a fault",
+    6: "The drive is busy. Disconnect any commissioning tool, wait, and start again",
     10: "Check the gateway's configuration and the unit number (--unit)",
     11: "Check the drive behind the gateway: power, address, baud rate",
 }
@@ -91,7 +91,7 @@ class CycleRefused(DriveFault):
         super().__init__(
             f"the drive refused a request of the cycle: {exception_text(code)}",
             where=where,
-            next_step=_STEPS.get(code, "Look at the drive's own panel"),
+            next_step=_STEPS.get(code, "Check the drive's panel for a fault"),
         )
         self.code = code
 
@@ -189,8 +189,8 @@ def reply_length(head: bytes) -> int | None:
 
 def _within(address: int, count: int, most: int) -> None:
     if not (1 <= count <= most and address >= 0 and address + count <= 0x1_0000):
-        raise ValueError(f"{count} registers from {address} on don't fit into a request")
+        raise ValueError(f"{count} registers from {address} on are not possible in one request")
 
 
 def _bad(what: str, where: str) -> BadReply:
-    return BadReply(what, where=where, next_step="Check wiring, shielding and termination; is a second master there?")
+    return BadReply(what, where=where, next_step="Check wiring and termination. Is a second master on the line?")

@@ -15,7 +15,7 @@ from drivers.preflight import PreflightTable
 from profiles.modbus import ModbusProfile, Position
 
 _TITLE = "angle of the motor"
-_ASKED = "whether the shaft turns as fast as the drive says is asked of the operator"
+_ASKED = "tdhil asks the operator to confirm the speed of the shaft"
 _WIDTHS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
 
 
@@ -53,7 +53,7 @@ def find_angle(table: PreflightTable, access: RegisterAccess, profile: ModbusPro
     """Return the profile's angle register if the drive gives it; add a note in any case."""
     entry = profile.position
     if entry is None:
-        table.note(_TITLE, f"not reported by this drive: {_ASKED}", "profile, position")
+        table.note(_TITLE, f"not reported by this drive; {_ASKED}", "profile, position")
         return None
     where = register_name(entry.register_)
     try:
@@ -61,5 +61,5 @@ def find_angle(table: PreflightTable, access: RegisterAccess, profile: ModbusPro
     except PreflightRefused as error:
         table.note(_TITLE, f"not reported: {error.what}; {_ASKED}", where)
         return None
-    table.note(_TITLE, f"{entry.counts_per_turn:.10g} counts a turn, held against the speed in stage 2", where)
+    table.note(_TITLE, f"{entry.counts_per_turn:.10g} counts per turn, compared with the speed in stage 2", where)
     return AngleRegister(entry, profile.line.word_order)

@@ -71,8 +71,8 @@ def check_setpoints(
             tests = [abs(value) for value in tests]     # its sign is in the control word, if anywhere
         echoes = [one for one in profile.echoes if one.setpoint == name]
         if name in profile.unseen:
-            text = "this drive doesn't show it: its scale and sign can be seen in motion only"
-            table.note(f"{name} setpoint as the drive understood it", text, "profile, echoes")
+            text = "not reported by this drive: its scale and sign are checked in motion only"
+            table.note(f"{name} setpoint as received by the drive", text, "profile, echoes")
         for echo in (*echoes, None):
             if _check_one(table, access, name, signal, lsb, tests, unit, echo, rated_nm, values) and echo is None:
                 read_back.add(name)
@@ -87,12 +87,12 @@ def _check_one(
     register = signal.register_
     seen_in = register if echo is None else echo.register_
     seen_lsb = lsb if echo is None else si_per_count(echo, values, rated_nm)
-    title = f"{name} setpoint " + ("reads back" if echo is None else "as the drive understood it")
+    title = f"{name} setpoint " + ("reads back" if echo is None else "as received by the drive")
     where = f"{register_name(register)} → {register_name(seen_in)}"
     # Half a count of the echo for its rounding, and one more because a drive may truncate instead.
     slack = 0.0 if echo is None else 1.5 * seen_lsb
     if slack > 0.5 * max(map(abs, tests)):
-        table.note(f"{title}, how finely", f"{seen_lsb:.3g} {unit} a count: too coarse for these limits to tell", where)
+        table.note(f"{title}, resolution", f"{seen_lsb:.3g} {unit} a count: too coarse for this check", where)
 
     def work() -> tuple[str, bool]:
         try:
@@ -118,9 +118,9 @@ def _check_one(
         except PreflightRefused as error:
             table.note(title, f"can't be read: {error.what}", where)
             return False
-    mend = "Word order, scale, sign or address of it is wrong in the profile, or the drive doesn't take it over"
+    mend = "Its word order, scale, sign or address is wrong in the profile, or the drive does not apply the setpoint"
     if echo is not None:
-        mend += ". Does it take its reference from this bus, in both directions? See the profile's source for the echo"
+        mend += ". Check that this bus is its reference source, in both directions"
     return table.attempt(title, wanted, where, work, mend)
 
 
@@ -159,7 +159,7 @@ def read_only_checks(
             check_string(table, access, profile, scales, torque_limit_nm)
     refused = any(check.outcome is Outcome.REFUSED for check in table.checks)
     if refused:
-        table.note("settings", "nothing was written to the drive: mend the rows above first", "driver")
+        table.note("settings", "nothing was written to the drive: correct the rows above first", "driver")
     return found, None if refused else scales, rated_nm or 1.0
 
 
@@ -193,8 +193,8 @@ def check_resolution(
             table.row(
                 f"{name} resolution", f"at most {COARSEST_SHARE * limit:.3g} {unit}", f"{count:.3g} {unit} a count",
                 False, register_name(signal.register_),
-                f"Is what scales it right ({signal.times or 'rated torque'}: register, word order, count), and the "
-                "limit in rig.yaml?",
+                f"Check what scales it ({signal.times or 'rated torque'}: register, word order, count), and the "
+                "limit in rig.yaml",
             )
 
 
@@ -250,7 +250,7 @@ def check_modes(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
         table.note("modes", "speed only: the speed-mode variant of the protocol", "profile, modes")
     if display is None:
         if modes.torque:
-            table.note("mode display", "the drive doesn't show what it regulates", "profile, modes.display")
+            table.note("mode display", "the drive does not display its mode", "profile, modes.display")
         if register is None:
             return
     for mode, value in wanted:
@@ -268,7 +268,7 @@ def check_modes(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
 
             table.attempt(
                 f"mode display for {mode.value}" if display is not None else f"mode {mode.value}", str(value),
-                where, work, "The drive doesn't take this mode over; see its manual",
+                where, work, "The drive does not accept this mode; see its manual",
             )
         elif display is not None and mode is Mode.SPEED:
             shown = access.read(display.register_) & 0xFFFF

@@ -148,7 +148,7 @@ class ModbusTarget:
                 "the drive did not change to speed mode, and its quick stop may release the shaft in torque mode"
             )
         if self._driven:
-            said.append("the drive went on following another master; stop that master too")
+            said.append("the drive still follows another master. Stop that master too")
         return (*said, *(() if self._standstill is None else self._standstill.remarks()))
 
     def _find_position(self) -> PositionSource | None:

@@ -39,13 +39,13 @@ def refusal(device: str, error: OSError | ValueError) -> PreflightRefused:
     if code is None and error.__context__ is not None and error.__context__.args:
         code = error.__context__.args[0]        # termios.error, which pyserial wraps without its number
     if code == errno.ENOENT:
-        what, step = "there is no such device", f"Plug the adapter in. {_there()}"
+        what, step = "the device does not exist", f"Plug the adapter in. {_there()}"
     elif code in (errno.EACCES, errno.EPERM):
         what, step = "permission denied", permission_command(device)
     elif code in (errno.EBUSY, errno.EAGAIN):
-        what, step = "another program has it open", f"End that program; it is shown by: fuser {device}"
+        what, step = "another program uses it", f"End that program. Find it with: fuser {device}"
     elif code in (errno.ENOTTY, errno.EISDIR):
-        what, step = "it is no serial device", _there()
+        what, step = "it is not a serial device", _there()
     else:
         what, step = str(error), "Check device, baud rate and parity"
     return PreflightRefused(f"can't open the serial line: {what}", where=device, next_step=step,
@@ -62,13 +62,13 @@ def permission_command(device: str) -> str:
     except (ImportError, OSError, KeyError):
         pass
     if group == "root":
-        return f"Only root may use it; for now: sudo chmod a+rw {device}"
+        return f"Only root may use it. Until the next restart: sudo chmod a+rw {device}"
     return f"sudo usermod -a -G {group} {os.environ.get('USER', '$USER')}, then log out and in again"
 
 
 def _there() -> str:
     found = sorted(str(path) for pattern in _CANDIDATES for path in Path("/dev").glob(pattern))
-    return f"These are there: {', '.join(found)}" if found else "No serial device is there at all"
+    return f"Serial devices found: {', '.join(found)}" if found else "No serial device was found"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ class RtuLink:
                 frame = frame[wanted:]
                 continue
             if len(frame) >= 2 and wanted is None and len(frame) > 2:
-                raise self._bad(f"what came is no reply: {_shown(frame)}")
+                raise self._bad(f"the received bytes are not a reply: {_shown(frame)}")
             if self.clock.now_s() >= deadline_s:
                 if frame:
                     raise self._bad(f"a short reply: {_shown(frame)}")
@@ -242,7 +242,7 @@ class RtuLink:
         return LinkLost(
             f"the serial line is lost: {what}",
             where=self.description,
-            next_step="Is the adapter plugged in? The drive's own watchdog stops the shaft. Then start anew",
+            next_step="Is the adapter plugged in? The drive's own watchdog stops the shaft. Then start again",
         )
 
     def _bad(self, what: str) -> BadReply:

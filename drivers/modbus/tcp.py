@@ -74,7 +74,7 @@ class TcpLink:
         while self._untaken():
             # The peer has not acknowledged the previous request. Another request would only wait behind it.
             if self.clock.now_s() >= deadline_s:
-                raise self._silent(timeout_s, "the connection takes nothing: half open, or the cable is out")
+                raise self._silent(timeout_s, "the connection accepts no data: half open, or the cable is unplugged")
             self._read(0.005)
         self._transaction = self._transaction % 0xFFFF + 1
         sent_s = self.clock.now_s()
@@ -82,7 +82,7 @@ class TcpLink:
             self._socket.settimeout(timeout_s)
             self._socket.sendall(self._framer.encode(pdu, unit, self._transaction))
         except TimeoutError as error:
-            raise self._silent(timeout_s, "the connection takes nothing") from error
+            raise self._silent(timeout_s, "the connection accepts no data") from error
         except OSError as error:
             self._lost(str(error), error)
         while True:
@@ -119,7 +119,7 @@ class TcpLink:
             return None
         _, protocol, length, _ = HEADER.unpack_from(self._buffer)
         if protocol != 0 or not 2 <= length <= 254:
-            raise self._untrusted(f"what came is no Modbus frame: {self._buffer[:16].hex(' ')}")
+            raise self._untrusted(f"the received bytes are not a Modbus frame: {self._buffer[:16].hex(' ')}")
         end = HEADER.size - 1 + length
         if len(self._buffer) < end:
             return None
@@ -195,17 +195,17 @@ class TcpLink:
             self._opening.setblocking(False)
             code = self._opening.connect_ex(self._peer)
             if code not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
-                self._lost(f"it could not be opened anew: {os.strerror(code)}")
+                self._lost(f"it could not be opened again: {os.strerror(code)}")
         _, opened, failed = select.select([], [self._opening], [self._opening], timeout_s)
         code = self._opening.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if code or (failed and not opened):
-            self._lost(f"it could not be opened anew: {os.strerror(code)}")
+            self._lost(f"it could not be opened again: {os.strerror(code)}")
         if opened:
             self._socket, self._opening, self._renew = self._prepared(self._opening), None, False
         elif now_s - self._renewed_s[-1] > self._connect_s:
-            self._lost("it could not be opened anew: no answer")
+            self._lost("it could not be opened again: no answer")
         else:
-            raise self._silent(timeout_s, "a foreign reply came, and the connection opened anew isn't there yet")
+            raise self._silent(timeout_s, "a reply to another request came, and the new connection is not open yet")
 
     def _untaken(self) -> bool:
         """Return whether the other end has not acknowledged all sent data. Known on Linux only."""
@@ -221,11 +221,11 @@ class TcpLink:
         return bool(struct.unpack("i", waiting)[0])
 
     def _silent(self, timeout_s: float, what: str) -> NoReply:
-        step = "Check cable and drive; is another master holding the drive's only connection?"
+        step = "Check cable and drive, and whether another master uses the drive's only connection"
         return NoReply(what, where=self.description, next_step=step)
 
     def _bad(self, what: str) -> BadReply:
-        step = "Is a gateway or a second master between here and the drive? Check the unit number (--unit)"
+        step = "Check for a gateway or a second master on the way to the drive, and the unit number (--unit)"
         return BadReply(what, where=self.description, next_step=step)
 
     def _untrusted(self, what: str) -> BadReply:
@@ -237,13 +237,13 @@ class TcpLink:
         raise LinkLost(
             f"the connection to the drive is lost: {what}",
             where=self.description,
-            next_step="Check cable and supply; the drive's own watchdog stops the shaft. Then start anew",
+            next_step="Check cable and supply. The drive's own watchdog stops the shaft. Then start again",
         ) from error
 
     def _unreachable(self, error: OSError) -> PreflightRefused:
         host, port = self._address
         if isinstance(error, ConnectionRefusedError):
-            what, step = "nothing listens there", f"Switch Modbus TCP on at the drive; is its port {port}?"
+            what, step = "nothing listens there", f"Enable Modbus TCP at the drive, and check that its port is {port}?"
         elif isinstance(error, socket.gaierror):
             what, step = f"no such host: {error.strerror}", "Give the drive's address with --host, such as 192.0.2.10"
         elif isinstance(error, TimeoutError) or error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):

@@ -41,7 +41,7 @@ class Heat:
         if limit_c is not None and not celsius:
             table.row(
                 "temperature limit", f"{limit_c:g} °C", "this profile names no register with a temperature", False,
-                "limits.temperature_c", "Take it out of rig.yaml: it would not be held",
+                "limits.temperature_c", "Remove it from rig.yaml: it would have no effect",
             )
         for one in self._in_status:
             self._row(table, one, self._access.read(self._status))
@@ -98,7 +98,7 @@ class Heat:
         raise LimitHit(
             f"too hot: {one.title}: {_shown(one, counts)}{beyond}. The shaft is being stopped",
             where=register_name(one.register_),
-            next_step="Let it cool down; ask for less torque or fewer periods",
+            next_step="Let it cool down. Request less torque or fewer periods",
             entry=MessageCode.DRIVE_TOO_HOT,
         )
 

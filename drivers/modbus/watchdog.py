@@ -89,13 +89,13 @@ def arm_watchdog(
     if limits.watchdog_s < LEAST_CYCLES * period_s:
         table.row(
             "watchdog time", f"at least {LEAST_CYCLES} cycles", f"{limits.watchdog_s:g} s", False, "limits.watchdog_s",
-            f"Give it at least {LEAST_CYCLES * period_s:.2g} s, or a faster line",
+            f"Set it to at least {LEAST_CYCLES * period_s:.2g} s, or use a faster line",
         )
         return False
     if entry.parameter is None:
         tried.row(
-            "watchdog", "armed and read back", "this profile doesn't say where its time stands", False, "profile",
-            "Name its parameter in the profile (watchdog.parameter): what can't be read back isn't known to be armed",
+            "watchdog", "armed and read back", "the profile does not name the parameter of its time", False, "profile",
+            "Name it in the profile (watchdog.parameter). tdhil must read the time back",
         )
         return settle(table, tried, accepted, lambda: True)
     parameter = profile.parameter(entry.parameter)
@@ -133,11 +133,11 @@ def check_who_feeds(
     others = _others_requests(access, profile, min(COUNT_EVERY_S, 0.25 * limits.watchdog_s), feed)
     found = f"{sure}: {ANY_CLIENT}"
     if others:
-        found += f". Another client is there: {others} requests of others in {COUNT_S:g} s"
+        found += f". Another client is active: it sent {others} requests in {COUNT_S:g} s"
     elif others is None:
-        found += ". Whether one is there can't be known: this drive counts no requests"
+        found += ". tdhil cannot detect such a client: this drive does not count requests"
     else:
-        found += f". None asked it anything for {COUNT_S:g} s"
+        found += f". No other client sent a request within {COUNT_S:g} s"
     if accepted:
         found += f"; accepted by {SHARED_FLAG}"
     if simulated or accepted:
@@ -145,9 +145,8 @@ def check_who_feeds(
     else:
         table.row(
             "watchdog fed by", "this host alone, or its control word", found, False, "profile, watchdog.fed_by",
-            "Take every other client off the drive (PLC, panel, historian, gateway with several connections); then this"
-            f" drive is taken by name only: {SHARED_FLAG}. If its manual says what feeds its time-out, correct the"
-            " profile",
+            "Disconnect all other clients (PLC, panel, historian, gateway with several connections), then add"
+            f" {SHARED_FLAG}. If the drive's manual states what feeds its time-out, correct the profile",
         )
     return True
 

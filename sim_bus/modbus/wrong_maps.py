@@ -11,7 +11,7 @@ reads_back_something_else `:NAME` the parameter NAME reads as 1.5 times its valu
 ========================  ==========================================================================================
 
 A register that echoes a setpoint is another register, with a count and a type of its own. scale_10 and unsigned do not
-change it, so it shows the setpoint as the drive understood it.
+change it, so it shows the setpoint as received by the drive.
 """
 
 

@@ -265,7 +265,7 @@ def test_a_drive_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog():
     run.drive.quick_stop()
     run.cycle()
     run.bank.writes.clear()
-    assert any("not known to be disabled" in line for line in run.drive.close())
+    assert any("not confirmed that the drive is disabled" in line for line in run.drive.close())
     assert run.bank.writes == []
 
 
@@ -337,7 +337,7 @@ def test_a_lost_line_is_said_every_time_and_closing_does_not_raise():
     run.link.transact = gone
     assert len(errors(run, 5)) == 5
     left = run.drive.close()                   # the settings: nobody knows whether it is disabled
-    assert len(left) == 6 and all("not given back" in line for line in left)
+    assert len(left) == 6 and all("not restored" in line for line in left)
     assert run.bank.words[40] == 500        # the watchdog stays armed
 
 

@@ -218,7 +218,7 @@ def test_a_wrong_transaction_id_costs_the_connection():
 @pytest.mark.parametrize("rubbish", [b"HTTP/1.1 400 Bad Request\r\n", bytes(6) + b"\x01\x03", b"\0\1\0\0\xff\xff\1\3"])
 def test_what_is_no_modbus_frame(rubbish):
     with Line("tcp", lambda number, request: [rubbish if number == 0 else good(request)]) as line:
-        with pytest.raises(BadReply, match="no Modbus frame"):
+        with pytest.raises(BadReply, match="not a Modbus frame"):
             line.ask()
         assert line.ask().pdu == GOOD
 
@@ -346,7 +346,7 @@ def test_sending_has_the_time_of_its_reply_whatever_was_waited_before(monkeypatc
 
 
 def test_no_such_device(tmp_path):
-    with pytest.raises(PreflightRefused, match="no such device") as caught:
+    with pytest.raises(PreflightRefused, match="the device does not exist") as caught:
         RtuLink(str(tmp_path / "ttyUSB7"), MonotonicClock())
     assert caught.value.next_step
 
@@ -354,7 +354,7 @@ def test_no_such_device(tmp_path):
 def test_a_file_is_no_line(tmp_path):
     path = tmp_path / "notes.txt"
     path.write_text("not a device")
-    with pytest.raises(PreflightRefused, match="no serial device"):
+    with pytest.raises(PreflightRefused, match="not a serial device"):
         RtuLink(str(path), MonotonicClock())
 
 

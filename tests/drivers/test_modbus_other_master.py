@@ -166,7 +166,7 @@ def test_silence_is_refused_where_the_other_master_feeds_the_watchdog_too():
     run = Run()
     run.foreign = {SPEED_SETPOINT + 1: 4775}
     run.lost(1.0)
-    with pytest.raises(CommandRejected, match="feeds the drive's watchdog, too"):
+    with pytest.raises(CommandRejected, match="also feeds the drive's watchdog"):
         run.drive.stop_feeding()
 
 

@@ -93,7 +93,7 @@ def test_input_registers_are_read_with_function_4():
 
 
 def test_half_a_number_is_never_written():
-    with pytest.raises(PreflightRefused, match="one piece"):
+    with pytest.raises(PreflightRefused, match="in one request"):
         plan_cycle(profile(wide=True, speed_setpoint=1, torque_setpoint=3, speed=17, torque=19, functions=(3, 6)))
 
 

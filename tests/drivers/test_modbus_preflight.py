@@ -256,7 +256,7 @@ def test_one_setpoint_that_is_wrong(bank, generic, setpoint, wrong):
     else:
         entry["register"]["type"] = "i16"
     name = setpoint.split("_")[0]
-    assert f"{name} setpoint as the drive understood it" in refused(bank, of(data))
+    assert f"{name} setpoint as received by the drive" in refused(bank, of(data))
 
 
 def test_setpoint_with_its_halves_swapped(bank, generic):
@@ -266,7 +266,7 @@ def test_setpoint_with_its_halves_swapped(bank, generic):
             bank.words[1], bank.words[2] = words[1], words[0]
 
     bank.on_write = swap
-    assert "speed setpoint as the drive understood it" in refused(bank, generic)
+    assert "speed setpoint as received by the drive" in refused(bank, generic)
 
 
 @pytest.mark.parametrize("address", [1, 3, 4, 36, 37, 38, 39, 40])
@@ -443,8 +443,8 @@ def test_an_echo_may_be_late_but_not_stay_away(bank, generic, late):
     drive = drive_on(bank, generic, clock)
     drive.connect()
     found = drive.preflight(LIMITS).refused
-    assert [check.name for check in found] == ["speed setpoint as the drive understood it"] * (late == 1000)
-    assert all("Does it take its reference from this bus" in check.next_step for check in found)
+    assert [check.name for check in found] == ["speed setpoint as received by the drive"] * (late == 1000)
+    assert all("Check that this bus is its reference source" in check.next_step for check in found)
     assert late == 3 or clock.now_s() > (ECHO_POLLS - 1.5) * ECHO_POLL_S   # the drive got its time
     assert clock.now_s() < 5.0
     assert bank.words[SPEED_SETPOINT] == bank.words[SPEED_SETPOINT + 1] == 0
@@ -463,7 +463,7 @@ def test_a_setpoint_that_cannot_be_read_back_stays_untested_and_that_is_said(ban
 
 def test_rig_and_drive_must_agree_on_every_parameter_that_the_rig_states(bank, generic):
     rows = refused(bank, generic, given={"rated_speed": 1500.0})
-    assert next(iter(rows.values())).next_step.startswith("rig.yaml and the drive disagree")
+    assert next(iter(rows.values())).next_step.startswith("rig.yaml and the drive state different values")
 
 
 def test_a_ramp_up_is_as_steep_as_the_quick_stop_and_no_steeper(bank, generic):

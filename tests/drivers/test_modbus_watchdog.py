@@ -53,7 +53,7 @@ def test_any_client_feeds_it_and_that_is_refused(what, sure):
     (check,) = found.refused
     assert check == row(found) and found.fed_by_any_client
     assert what.replace("_", " ") in check.found and "will not stop by itself" in check.found
-    assert "can't be known" in check.found
+    assert "cannot detect such a client" in check.found
     assert FLAG in check.next_step
 
 
@@ -104,9 +104,9 @@ def test_a_drive_that_counts_shows_another_client(by, others):
     profile = fed_by("any_request", request_counter=register)
     found = row(preflight(profile, bank=Counting(others, diagnostics=by == "function 8"))).found
     if others:
-        assert f"Another client is there: 96 requests of others in {COUNT_S:g} s" in found
+        assert f"Another client is active: it sent 96 requests in {COUNT_S:g} s" in found
     else:
-        assert "None asked it anything for 3 s" in found
+        assert "No other client sent a request within 3 s" in found
 
 
 def test_counting_keeps_the_armed_watchdog_fed():

@@ -76,7 +76,7 @@ def test_a_profile_that_mistakes_what_a_count_of_a_setpoint_is(name, setpoint, f
     entry = getattr(profile.cycle, f"{setpoint}_setpoint")
     wrong = mistaken(profile, setpoint, {"per_lsb": factor * entry.per_lsb})
     names = {check.name for check in refused(worn=profile, read=wrong)}
-    assert f"{setpoint} setpoint as the drive understood it" in names
+    assert f"{setpoint} setpoint as received by the drive" in names
 
 
 @pytest.mark.parametrize("name", sorted({name for name, _ in SHOWN}))
@@ -85,7 +85,7 @@ def test_a_profile_that_mixes_up_what_an_echo_shows(name):
     profile = load_modbus_profile(name)
     echoes = tuple(echo.model_copy(update={"per_lsb": 10.0 * echo.per_lsb}) for echo in profile.echoes)
     names = [check.name for check in refused(worn=profile, read=profile.model_copy(update={"echoes": echoes}))]
-    assert names == [f"{echo.setpoint} setpoint as the drive understood it" for echo in echoes]
+    assert names == [f"{echo.setpoint} setpoint as received by the drive" for echo in echoes]
     assert refused(worn=profile, read=profile) == ()
 
 
@@ -99,4 +99,4 @@ def test_an_echo_too_coarse_for_the_limits_says_so(speed_rad_s, coarse):
     drive.connect()
     limits = DriveLimits(speed_rad_s=speed_rad_s, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
     notes = [check.name for check in drive.preflight(limits).checks if "too coarse" in check.found]
-    assert notes == ["speed setpoint as the drive understood it, how finely"] * coarse
+    assert notes == ["speed setpoint as received by the drive, resolution"] * coarse

@@ -137,7 +137,7 @@ def test_a_consumer_that_is_set_otherwise_stays_refused(canopen, peer, node, tim
         assert_taken(found)
     else:
         assert_refused(found, "watchdog")
-        assert "set otherwise" in found.refused[-1].next_step
+        assert "with another setting" in found.refused[-1].next_step
 
 
 def test_a_watchdog_that_is_armed_and_does_something_else_stays_refused(canopen, peer):
@@ -254,7 +254,7 @@ def test_a_time_out_that_is_set_otherwise_stays_refused(modbus, counts):
     deaf(bank)
     found = modbus(bank)
     assert_refused(found, "time-out of the host's writing")
-    assert "set otherwise" in found.refused[-1].next_step
+    assert "with another setting" in found.refused[-1].next_step
 
 
 def test_a_reaction_that_is_wrong_stays_refused_where_the_time_can_be_set(modbus):

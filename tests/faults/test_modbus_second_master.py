@@ -128,7 +128,9 @@ def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
     acted = at(monkeypatch, stage, 5.0, lambda sample: other.begin(sample.time_s, 1.0 / hz, pdu))
     ended = run(tmp_path, "--drive", "modbus")
     assert ended.done.code in (5, 8), ended.done.err
-    ended.assert_ended(ended.done.code, "another master commands this drive", "this run wrote", "Take the other master")
+    ended.assert_ended(
+        ended.done.code, "another master commands this drive", "this run wrote", "Disconnect the other master",
+    )
     shaft = ended.shaft
     after = shaft.time_s >= acted[0]
     assert abs(shaft.speed_rad_s[after]).max() < 7.0

@@ -126,7 +126,7 @@ def test_nobody_listens_there(tmp_path):
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize(("number", "said"), [(2, "no such device"), (13, "sudo "), (16, "another program")])
+@pytest.mark.parametrize(("number", "said"), [(2, "the device does not exist"), (13, "sudo "), (16, "another program")])
 @pytest.mark.parametrize("command", ["identify", "scan", "doctor"])
 def test_a_serial_device_that_can_not_be_opened(monkeypatch, command, number, said):
     def refuse(*arguments, **options):

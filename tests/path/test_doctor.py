@@ -65,7 +65,7 @@ def test_what_a_killed_run_left_in_a_drive_is_named(tmp_path):
     book.changing("6072h", b"\x64\x00", b"\x90\x01")
     done = tdhil("doctor", "--log", tmp_path / "run.mcap")
     assert done.code == 4
-    assert "top drive, node1: 6072h was left at 400, and was 100 before" in done.out
+    assert "top drive, node1: 6072h was left at 400; before that run it was 100" in done.out
     book.given_back("6072h")
     assert tdhil("doctor", "--log", tmp_path / "run.mcap").code == 0
 

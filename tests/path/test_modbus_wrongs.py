@@ -128,7 +128,7 @@ def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     found = drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
     assert found.refused == ()
     notes = [check.name for check in found.checks if "in motion only" in check.found]
-    assert notes == [f"{name} setpoint as the drive understood it" for name in unseen(profile)]
+    assert notes == [f"{name} setpoint as received by the drive" for name in unseen(profile)]
 
 
 def unseen(profile):
