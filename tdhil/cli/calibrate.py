@@ -67,11 +67,11 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
                         " (default motor)")
     add_option(parser, OPTION["confidence"])
     parser.add_argument("--plan", action="store_true",
-                        help="from one log: which body, and how long a run, reach --want")
+                        help="from one log: the body and the duration of a run that reach --want")
     parser.add_argument("--want", type=share, default=0.01, metavar="SHARE",
-                        help="with --plan: half-width of J that is wanted (default 1 %%)")
+                        help="with --plan: requested half-width of J (default 1 %%)")
     parser.add_argument("--save", type=Path, metavar="calibration.json",
-                        help="where the calibration goes, for torque_calibration in rig.yaml; never over a file")
+                        help="new file for the calibration, for torque_calibration in rig.yaml")
     add_option(parser, OPTION["json"])
     add_report_option(parser, "report")
     add_head_options(parser)
@@ -83,7 +83,7 @@ def run_torque(namespace: argparse.Namespace) -> int:
     """Read the logs, fit them together, and print the result; or print a plan."""
     for flag, names in (("--columns", namespace.columns), ("--column", namespace.column)):
         if names and "=" not in names[-1]:
-            raise UsageError("takes every word behind it", where=flag, next_step=f"Name the logs before {flag}")
+            raise UsageError("takes all later words", where=flag, next_step=f"Name the logs before {flag}")
     check_trace(namespace)
     asked = OPTION["confidence"]
     confidence = asked.default if namespace.confidence is None else namespace.confidence

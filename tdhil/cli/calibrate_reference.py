@@ -54,8 +54,8 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
 def require_new(path: Path | None) -> None:
     """Raise UsageError if the file exists already."""
     if path is not None and path.exists():
-        raise UsageError("is there already, and is left as it is", where=f"--save {path}",
-                         next_step="Name another file, or move that one away")
+        raise UsageError("already exists and was not overwritten", where=f"--save {path}",
+                         next_step="Name another file, or move the existing one")
 
 
 def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:

@@ -67,7 +67,7 @@ def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
     saved = first.with_name(f"{first.stem}-calibration.json")
     check_log_path(second, OPTION["log"].flag)
     if saved.exists():
-        raise UsageError("is there already, and is left as it is", where=str(saved),
+        raise UsageError("already exists and was not overwritten", where=str(saved),
                          next_step="Move that file away, or name another log with --log")
     if options.json or options.trace is not None:
         raise UsageError("does not go with --calibrate", where=options.source("json" if options.json else "trace"))

@@ -47,7 +47,7 @@ def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
                         help="shaft that was counted; main: behind the gear (default motor)")
     add_option(parser, OPTION["confidence"])
     parser.add_argument("--want", type=share, default=0.01, metavar="SHARE",
-                        help="half-width of the factor that is wanted; a wider result is refused (default 1 %%)")
+                        help="largest half-width of the factor; a wider result is refused (default 1 %%)")
     parser.add_argument("--save", type=Path, metavar="calibration.json",
                         help="where the result goes: a new file, or one that holds a torque calibration of this drive")
     add_option(parser, OPTION["json"])
@@ -111,7 +111,7 @@ def _confidence(namespace: argparse.Namespace) -> float:
 def _check(namespace: argparse.Namespace) -> None:
     """Raise UsageError for options that are impossible, or do not go together."""
     if namespace.columns and "=" not in namespace.columns[-1]:
-        raise UsageError("takes every word behind it", where="--columns", next_step="Name the log before --columns")
+        raise UsageError("takes all later words", where="--columns", next_step="Name the log before --columns")
     check_trace(namespace)
     confidence = _confidence(namespace)
     if wrong := OPTION["confidence"].refusal(confidence):
@@ -154,7 +154,7 @@ def _found(
     if namespace.turns is None:
         assert record is not None
         return speed_by_position(record, namespace.want, confidence), {}, (
-            "the counts per turn of the drive's position are taken as exact: a wrong number would be a wrong factor",)
+            "the counts per turn of the drive's position count as exact: a wrong number gives a wrong factor",)
     ratio = 1.0
     if namespace.at == "main":
         if record is None and namespace.gear_ratio is None:

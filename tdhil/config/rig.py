@@ -187,7 +187,7 @@ class DriveData(DataModel):
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
         """Return errors: a standard deviation without its value."""
         return [
-            (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
+            (f"{name}_sd_s", f"needs {name}_s, the value whose standard deviation it is")
             for name in ("speed_lag", "torque_lag")
             if values.get(f"{name}_sd_s") is not None and values.get(f"{name}_s", ...) is None
         ]

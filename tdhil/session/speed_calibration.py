@@ -148,6 +148,6 @@ def check_speed_place(path: Path) -> None:
     except (OSError, ValueError, RecursionError):
         alone = None
     if isinstance(alone, dict) and SECTION in alone:
-        raise UsageError("holds a speed calibration already, and is left as it is", where=f"--save {path}",
-                         next_step="Name another file, or move that one away")
+        raise UsageError("already holds a speed calibration and was not changed", where=f"--save {path}",
+                         next_step="Name another file, or move the existing one")
     load_calibration(path)

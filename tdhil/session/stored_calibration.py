@@ -49,8 +49,8 @@ def save_calibration(document: Mapping[str, Any], path: Path) -> None:
             json.dump(document, file, ensure_ascii=False, indent=2, allow_nan=False)
             file.write("\n")
     except FileExistsError:
-        raise UsageError("is there already, and is left as it is", where=f"--save {path}",
-                         next_step="Name another file, or move that one away") from None
+        raise UsageError("already exists and was not overwritten", where=f"--save {path}",
+                         next_step="Name another file, or move the existing one") from None
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}") from error
 

@@ -85,7 +85,7 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
     values, covariance, known, dof, sharing, together = _joint([run.record.recording for run in runs], identified)
     if not together:
         warnings.append("the runs were not fitted together, since not all of them have a periodic excitation:"
-                        " the intervals are wider than need be")
+                        " the intervals are wider than necessary")
     noise = np.sqrt(np.maximum(np.diag(known), 0.0)) / values
     bodies = tuple(
         BodyRun(name, run.added_kg_m2 / square, _sd(run) / square, float(share))
