@@ -83,7 +83,7 @@ def test_taken_by_name_and_the_line_is_gone(unarmed, bus, seen):
 def test_set_otherwise_is_refused_by_name_too(rehearse, bus):
     fault = f"reads-back-otherwise={WATCHED[bus]}"
     run = rehearse("--drive", bus, "--fault", fault, BY_NAME)
-    run.assert_ended(4, "set otherwise")
+    run.assert_ended(4, "with another setting")
     run.assert_nothing_moved()
     run.assert_log_whole()
 
