@@ -28,11 +28,11 @@ def conclude(case: Case, finding: Finding) -> Identification:
     if case.aborted is not None:
         said = _aborted(case.aborted)
         if inertia is not None:
-            partial = f"{said}: the result is from what was recorded before"
+            partial = f"{said}. The result uses the data recorded before"
             warnings = (CodedText(partial, MessageCode.RUN_ENDED_EARLY), *warnings)
         else:
-            reason = f"{said}; what was recorded before can't tell: {reason}"
-            advice = "mend what ended the run, and run it again"
+            reason = f"{said}. The data recorded before do not suffice: {reason}"
+            advice = "remove the cause of the abort, and repeat the run"
     return Identification(**finding.quantities() | {
         "verdict": verdict, "reason": reason, "advice": advice, "entry": entry, "inertia": inertia,
         "calibration_advised": calibrate,

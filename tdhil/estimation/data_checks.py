@@ -184,7 +184,7 @@ def _check_segment(segment: Segment, name: str) -> None:
             entry=MessageCode.EXCITATION_MISDECLARED,
         )
     if len(set(whole)) < len(whole):
-        raise Refused(f"{name}: a line stands there twice", "declare each line once",
+        raise Refused(f"{name}: it declares the same line twice", "declare each line once",
                       entry=MessageCode.EXCITATION_MISDECLARED)
 
 
@@ -196,7 +196,7 @@ def _check_rate(segment: Segment, part: Samples) -> None:
     if aliased(fastest, interval):
         slow = fastest * interval > _SECONDS_NOT
         raise Refused(
-            f"aliased: one sample every {interval:.3g} s can't tell a line at {fastest:g} Hz from its image",
+            f"aliased: at one sample every {interval:.3g} s, a line at {fastest:g} Hz looks like a slower one",
             "check the unit of the time stamps" if slow else
             f"sample at {math.ceil(fastest / SAMPLED_SHARE):d} Hz or faster, or excite with lower lines",
             entry=MessageCode.TOO_FEW_SAMPLES,
@@ -274,7 +274,7 @@ def _check_known(recording: Recording) -> None:
     limit = recording.torque_limit_nm
     if not all(math.isfinite(size) and size >= 0.0 for size in sizes) or (limit is not None and math.isnan(limit)):
         raise Refused(
-            "a resolution, lag, limit or standard deviation that goes with the recording is no usable number",
+            "a resolution, lag, limit or standard deviation of the recording is not a usable number",
             "check how the recording was made", entry=MessageCode.DATA_UNUSABLE,
         )
 

@@ -49,13 +49,13 @@ def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_tor
         return
     if mean_speed * mean_torque < 0.0:
         raise Refused(
-            "the torque opposes every acceleration, and the mean speed too: its sign is the wrong way round",
-            "count torque positive that drives the speed positive",
+            "the torque opposes every acceleration and the mean speed: its sign is inverted",
+            "count torque as positive if it accelerates the shaft in positive direction",
             entry=MessageCode.SIGNALS_SWAPPED,
         )
     raise Refused(
-        "the torque trails the speed at every line, as for a negative inertia: speed and torque stand in each other's "
-        "place, or one of them has the wrong sign",
+        "the torque trails the speed at every line, as with a negative inertia. Speed and torque are exchanged, "
+        "or one of them has the wrong sign",
         "check which column is which, and the sign of the torque",
         entry=MessageCode.SIGNALS_SWAPPED,
     )
@@ -97,13 +97,13 @@ def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> No
         if at_rest > _LEAST_SHARE * len(part):
             raise Refused(
                 f"stick-slip: the shaft stood still for {at_rest / len(part):.1%} of the excitation {where}",
-                "turn faster on the mean, or excite with less amplitude, so that the shaft never stops",
+                "raise the mean speed or lower the amplitude, so that the shaft never stops",
                 entry=MessageCode.STICK_SLIP_RECORDED,
             )
         if behind > _LEAST_SHARE * len(part):
             raise Refused(
                 f"the shaft turned backwards for {behind / len(part):.1%} of the excitation {where}",
-                "turn faster on the mean, or excite with less amplitude, for friction jumps at zero speed",
+                "raise the mean speed or lower the amplitude. Friction jumps at zero speed",
                 entry=MessageCode.SHAFT_TURNED_BACK,
             )
 
@@ -224,9 +224,9 @@ def undeclared_warning(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, 
         if found:
             hertz, amplitude, declared = max(found, key=lambda line: line[1])
             said.append(CodedText(
-                f"undeclared motion: the {name} swings by {amplitude:.2g} {unit} at {hertz:.4g} Hz, which is no line "
-                f"of the excitation (the strongest has {declared:.2g} {unit}): a limit cycle, a resonance, ripple "
-                "folded down by slow sampling, or other lines than were declared",
+                f"undeclared motion: the {name} swings by {amplitude:.2g} {unit} at {hertz:.4g} Hz, which is no "
+                f"excited line (the strongest line has {declared:.2g} {unit}). Look for a limit cycle, a "
+                "resonance, aliased ripple, or lines that were declared wrongly",
                 MessageCode.UNDECLARED_MOTION,
             ))
     return tuple(said)

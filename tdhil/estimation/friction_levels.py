@@ -100,8 +100,8 @@ def warming_warning(warming: FrictionDrift) -> tuple[str, ...]:
         return ()
     how = "falls" if warming.rate < 0.0 else "rises"
     return (CodedText(
-        f"drifting: at steady speed the torque {how} by {abs(60.0 * warming.rate):.2g} N·m a minute (friction that "
-        "warms, or a wandering torque zero), which is allowed for; warm the machine up first",
+        f"drifting: the torque at steady speed {how} by {abs(60.0 * warming.rate):.2g} N·m a minute (warming "
+        "friction, or a drifting torque zero). The interval allows for this. Warm the machine up first",
         MessageCode.FRICTION_DRIFTS,
     ),)
 

@@ -333,8 +333,9 @@ def _problem(case: PeriodicCase, asked: ImpedanceInput) -> ImpedanceProblem | Dr
     if len(clear) < _LEAST_LINES:
         what = "torque offset" if asked.by == OFFSET else "speed reference"
         return refusal(
-            asked, f"only {len(clear)} of {len(lines)} lines of the {what} show in speed and torque",
-            "does the drive take it (its mode, its profile)? Else give it more room",
+            asked, f"only {len(clear)} of {len(lines)} lines of the {what} are visible in speed and torque",
+            "check that the drive accepts it in this mode. If it does, raise limits.torque_nm or widen the speed "
+            "window",
         )
     covariance: ComplexArray = np.array([line.covariance for line in lines], dtype=np.complex128)
     white: ComplexArray = np.linalg.inv(np.linalg.cholesky(covariance)).astype(np.complex128)
@@ -647,8 +648,8 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
             bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=shows[0],
             reason=f"the residuals contradict a speed loop with {expected} (p = {p_value:.2g}): {other} would explain"
             " them",
-            advice="measure by the torque offset (--impedance offset), which a reference filter doesn't touch; or"
-            " switch the filter off at the drive, or state it (drive_data.reference_filter_s in rig.yaml)",
+            advice="measure with --impedance offset: a reference filter does not affect it. Or disable the "
+                   "filter in the drive, or state it (drive_data.reference_filter_s in rig.yaml)",
         )
     if rejects(test):
         return replace(
@@ -665,7 +666,7 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
     gain = spread.around(lambda theta: theta[[GAIN]], extra[:1])[0]
     wide = not gain.bounded
     if wide and not (gain.finite and _bounded_at_ratio(problem, fitted, confidence)):
-        return replace(bare, reason="the data leave the loop's gain open", advice=_MORE)
+        return replace(bare, reason="the data do not determine the gain of the loop", advice=_MORE)
     gain, inner, torque_lag, speed_filter = spread.at_least_zero(rows, extra_sd=extra, profiled=wide)
     explained = "untested" if test is None else f"p = {p_value:.2g}"
     return replace(
@@ -674,7 +675,7 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
         reason=f"a speed loop of P and I on a rigid shaft explains speed and torque ({explained})",
         advice="; ".join(
             ([_WIDE] if wide else [])
-            + ([] if asked.string_nm_s_rad > 0.0 else ["name the string (--string-impedance) to have |r| as well"])),
+            + ([] if asked.string_nm_s_rad > 0.0 else ["add --string-impedance to get |r|, too"])),
         gain_nm_s_rad=gain,
         integral_nm_rad=_not_below_zero(integral),
         inner_lag_s=inner,
@@ -687,8 +688,8 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
 
 
 _WIDE: Final = (
-    "P and the lags have wide intervals, because the scales of commanded and reported torque may differ: if both are"
-    " known better, state a smaller drive_data.torque_scale_rel_sd in rig.yaml"
+    "P and the lags have wide intervals, because the scales of commanded and reported torque may differ. If you "
+    "know both better, state a smaller drive_data.torque_scale_rel_sd in rig.yaml"
 )
 
 

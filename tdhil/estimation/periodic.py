@@ -53,8 +53,8 @@ from tdhil.recording import Excitation
 _ROUGH_REL_SD = 0.1       # relative standard uncertainty of the rough inertia as a prior
 _LEAST_NU = 2.0     # least complex degrees of freedom of the weights; with fewer the interval has no meaning
 _BEFORE_ECHO_HELPS = (
-    "use --excitation prbs, which asks only for the time before an echo; or lift the bit off bottom, take weight off"
-    " it, or excite with more amplitude or for longer"
+    "add --excitation prbs, which uses only the time before the echo. Or lift the bit off bottom, reduce the "
+    "weight on it, raise the amplitude, or excite for more periods"
 )
 _ONE_LINE = Refusal(
     "one excited line can't test the paper's assumption that the reported signals are not filtered",
@@ -108,7 +108,8 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         return replace(case, lines=every, usable=every, sound=True)
     lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
     if not lines:
-        raise _too_few(case, "no excited line stands clear of the scatter", "excite with more amplitude, or for longer")
+        raise _too_few(case, "no excited line is above the scatter", "raise the amplitude, or excite for more "
+                                                                     "periods")
     warnings = case.warnings
     if len(lines) < len(every):
         warnings = (*warnings, CodedText(
@@ -235,8 +236,8 @@ def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
     best = max(weak, key=lambda line: float(np.max(np.abs(line.speed))) / math.sqrt(max(line.s_ww, 1e-300)))
     moved, scatter = float(np.max(np.abs(best.speed))), math.sqrt(best.s_ww)
     return Refused(
-        f"{what}: at {best.hertz:.3g} Hz the excitation moves the speed by ±{moved:.2g} rad/s, and the string below by"
-        f" ±{scatter:.2g} rad/s, another way in each period",
+        f"{what}. At {best.hertz:.3g} Hz the excitation moves the speed by ±{moved:.2g} rad/s. The string moves "
+        f"it by ±{scatter:.2g} rad/s, differently in each period",
         _BEFORE_ECHO_HELPS, entry=MessageCode.TOO_FEW_LINES,
     )
 

@@ -199,8 +199,8 @@ def left_out_warnings(recording: Recording) -> tuple[str, ...]:
     if stuck is not None:
         where, share = float(recording.time_s[np.argmax(stuck)]), float(np.mean(stuck))
         said.append(CodedText(
-            f"the feedback stuck although it was called fresh, first at {where:.6g} s: {share:.1%} of the samples were "
-            "left out",
+            f"the feedback did not change although it was marked as fresh, first at {where:.6g} s. tdhil left out "
+            f"{share:.1%} of the samples",
             MessageCode.SAMPLES_LEFT_OUT,
         ))
     return tuple(said)

@@ -57,7 +57,7 @@ def stretched(finding: Finding, recording: Recording) -> Finding:
         finding,
         advice="shorten the cycle (baud rate, function 23, TCP), or use a drive's torque mode",
         warnings=(*finding.warnings, CodedText(
-            f"{note}: J may be off by {share:.1%} for that alone",
+            f"{note}. This alone may change J by {share:.1%}",
             MessageCode.STEPPED_SETPOINT)),
     )
 

@@ -18,7 +18,7 @@ def torque_reversed(r, rng):
     return replace(r, torque_nm=-r.torque_nm)
 
 
-@family("place")
+@family("exchanged")
 def columns_exchanged(r, rng):
     return replace(r, torque_nm=r.speed_rad_s, speed_rad_s=r.torque_nm, torque_resolution_nm=0.0105,
                    speed_resolution_rad_s=0.5)
@@ -135,7 +135,7 @@ def offset_unknown(r, rng):
     return replace(r, torque_offset_nm=float(rng.choice((np.nan, np.inf))))
 
 
-@family("goes with the recording")
+@family("of the recording is not a usable number")
 def unusable_knowledge(r, rng):
     wrong = float(rng.choice((np.nan, -1.0, np.inf)))
     return (

@@ -70,7 +70,7 @@ def test_the_inertia_is_covered(record):
     assert found.inertia.low <= PLANT.motor <= found.inertia.high
     assert found.inertia.value == pytest.approx(PLANT.motor, rel=0.08)
     assert found.inertia.high - found.inertia.low < 0.4 * PLANT.motor
-    assert any("comes back from below within 1.40 s" in one for one in found.inertia.conditional_on)
+    assert any("almost no echo returns within 1.40 s" in one for one in found.inertia.conditional_on)
     assert {line.source for line in found.budget} >= {"noise", "echo", "string", "lags", "torque scale"}
 
 
@@ -181,7 +181,7 @@ def test_lines_that_the_string_drowns_name_it(strongest_nm):
     weak = records(replace(PLANT, bit_noise_nm=1000.0, answered=False), [1], lines, torques, PERIOD_S, 8)[0]
     found = identify(replace(weak, excitation=replace(weak.excitation, kind="multisine")))
     assert found.verdict is Verdict.NOT_IDENTIFIABLE
-    assert "the string below by ±" in found.reason and "--excitation prbs" in found.advice
+    assert "The string moves it by ±" in found.reason and "--excitation prbs" in found.advice
 
 
 @pytest.mark.heavy
@@ -193,6 +193,6 @@ def test_where_the_string_drowns_some_lines_and_the_others_tell_little_it_says_w
     weak = records(replace(PLANT, bit_noise_nm=500.0, answered=False), [1], lines_hz, torques, PERIOD_S, 8)[0]
     found = identify(replace(weak, excitation=replace(weak.excitation, kind="multisine")))
     assert found.verdict is verdict
-    assert found.advice.startswith("use --excitation prbs")
+    assert found.advice.startswith("add --excitation prbs")
     unknown = identify(replace(weak, pipe=None, excitation=replace(weak.excitation, kind="multisine")))
     assert "prbs" not in unknown.advice

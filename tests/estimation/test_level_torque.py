@@ -39,7 +39,7 @@ def test_a_torque_scale_that_halves_or_doubles_is_found(recorded, factor):
     recording = scaled_in_stage_5(recorded[0], factor)
     found = level_contradiction(recording, usable_samples(recording))
     assert found is not None
-    assert "levels of stage 2" in found.reason
+    assert "operating points of stage 2" in found.reason
     assert found.entry is MessageCode.TORQUE_AT_SPEED_CHANGED
 
 

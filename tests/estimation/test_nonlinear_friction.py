@@ -130,7 +130,7 @@ def test_without_noise_the_inertia_is_the_true_one(friction):
     assert said.inertia.low <= 104.0 <= said.inertia.high
     assert "contradict straight friction" in said.reason
     assert said.coulomb_nm is None
-    assert sum("no straight line" in text for text in said.warnings) == 1
+    assert sum("friction is not linear in speed" in text for text in said.warnings) == 1
     total = np.sqrt(sum(line.half_width_kg_m2**2 for line in said.budget if line.source != "torque scale"))
     assert total == pytest.approx(0.5 * (said.inertia.high - said.inertia.low), rel=0.3)
 
@@ -142,7 +142,7 @@ def test_a_bend_that_straight_friction_hardly_hides_is_seen():
     """
     said = identify(bent(closed_form(noise=1.0, seed=6), lambda w: 0.021 * w**2))
     assert said.model == MODEL, said.reason
-    assert "speak against straight friction (p = 0.006)" in said.reason
+    assert "cast doubt on linear friction (p = 0.006)" in said.reason
     assert said.residual.p_value > 0.1
     assert said.inertia.low <= 104.0 <= said.inertia.high
 

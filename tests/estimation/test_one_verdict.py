@@ -85,7 +85,7 @@ def test_what_the_reading_adds_widens_both_intervals():
 
 def test_an_abort_goes_before_all_that_the_data_say():
     stood, fell = (conclude(case(aborted=STAGE), finding) for finding in (FOUND, REJECTED))
-    assert stood.warnings[0].startswith("the run was aborted in stage acquire (the bus is gone): ")
+    assert stood.warnings[0].startswith("the run was aborted in stage acquire (the bus is gone). ")
     assert stood.reason == FOUND.explained
-    assert fell.reason.startswith("the run was aborted in stage acquire (the bus is gone); ")
+    assert fell.reason.startswith("the run was aborted in stage acquire (the bus is gone). ")
     assert fell.reason.endswith(REJECTED.contradicted)

@@ -144,7 +144,7 @@ def test_a_string_must_gain_more_than_chance_gives(seed):
     total = found.compliant.total_inertia
     assert total.low <= plant.total <= total.high
     assert total.high - total.low < 0.1 * plant.total
-    assert not any("J_r + J_L is left open" in warning for warning in found.warnings)
+    assert not any("interval of J_r + J_L is open" in warning for warning in found.warnings)
 
 
 @few

@@ -89,7 +89,7 @@ def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
     """
     windy = replace(quiet(FIELD), viscous=2.0, quadratic=1.8)
     said = found(simulate(windy, "torque pulses", [1])[0])
-    assert any("friction is no straight line over speed" in warning for warning in said.warnings)
+    assert any("friction is not linear in speed" in warning for warning in said.warnings)
     assert said.inertia.value == pytest.approx(104.0, rel=1e-3)
     assert said.inertia.low <= 104.0 <= said.inertia.high
 

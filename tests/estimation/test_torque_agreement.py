@@ -96,12 +96,12 @@ def test_in_speed_mode_the_demanded_torque_is_the_reference():
     assert (found.reference, found.demanded_ratio) == ("demanded", None)
     said = torque_contradiction((found,), 0.02)
     assert "of the demanded torque" in said.reason
-    assert "commanded torque would tell which of the two is wrong" in said.advice
+    assert "A run in torque mode shows which of the two is wrong" in said.advice
 
 
 @pytest.mark.parametrize(("by_demanded", "by_reported", "alone"), [
-    (1.0, 0.5, "the reported torque stands alone"), (0.5, 0.5, "the commanded torque stands alone"),
-    (0.75, 0.5, "no two of the three fit"),
+    (1.0, 0.5, "but the reported torque does not"), (0.5, 0.5, "but the commanded torque does not"),
+    (0.75, 0.5, "no two of the three agree"),
 ])
 def test_the_signal_that_stands_alone_is_named(by_demanded, by_reported, alone):
     one = record(by_reported, 4, (0.1,))
@@ -170,7 +170,7 @@ def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor)
         speed = np.where(one.time_s < 43.0, 1.0, factor) * one.speed_rad_s
         found = identify(replace(one, speed_rad_s=speed), Options(tolerance=0.2))
         assert (found.verdict, found.inertia) == (Verdict.MODEL_REJECTED, None)
-        assert "two routes through the same run contradict each other" in found.reason
+        assert "two methods contradict each other" in found.reason
 
 
 @pytest.mark.heavy
@@ -178,7 +178,7 @@ def test_the_least_change_of_a_scale_that_shows_is_told(runs):
     for one in runs:
         opinion = identify(one).second_opinions[0]
         least = opinion.least_scale_change
-        assert opinion.note.endswith(f"shows from ±{least:.0%} on")
+        assert opinion.note.endswith(f"detects a change of scale of ±{least:.0%} or more at stage 5")
         assert 0.05 <= least < 0.2
         speed = np.where(one.time_s < 43.0, 1.0, 1.0 - 1.8 * least) * one.speed_rad_s
         assert identify(replace(one, speed_rad_s=speed), Options(tolerance=0.2)).inertia is None
@@ -204,7 +204,8 @@ def test_an_angle_that_fits_changes_nothing(turned):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("factor", "said"), [
-    (0.9, "contradicts the shaft's angle"), (1.15, "contradicts the shaft's angle"), (0.94, "changed its scale"),
+    (0.9, "contradicts the shaft's angle"), (1.15, "contradicts the shaft's angle"),
+    (0.94, "scale of the reported speed changed"),
 ])
 def test_a_speed_that_the_angle_contradicts_is_never_valid(turned, factor, said):
     speed = np.where(turned.time_s < 43.0, 1.0, factor) * turned.speed_rad_s
@@ -238,4 +239,4 @@ def test_counts_that_the_operator_takes_as_wrong_contradict_nothing(turned, coun
     speed = np.where(turned.time_s < 43.0, 1.0, 0.9) * turned.speed_rad_s
     found = identify(replace(accepted, speed_rad_s=speed, stages=()))
     assert (found.verdict, found.inertia) == (Verdict.MODEL_REJECTED, None)
-    assert "changed its scale" in found.reason
+    assert "scale of the reported speed changed" in found.reason

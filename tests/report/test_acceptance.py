@@ -94,7 +94,7 @@ def test_the_inertia_of_other_bodies_is_not_judged(scope, load, name, verdict):
 def test_the_document_states_to_which_bodies_its_inertia_refers():
     rigid = replace(full(), compliant=None)
     with_string = replace(recording(), has_drill_string=True)
-    together = CodedText("all turns as one", MessageCode.STRING_MOVES_WITH_MOTOR)
+    together = CodedText("it turns together with the motor", MessageCode.STRING_MOVES_WITH_MOTOR)
     for found, log, scope in (
         (full(), recording(), "motor_side"), (rigid, recording(), "motor_and_load"),
         (replace(rigid, warnings=(together,)), with_string, "motor_and_string"), (rigid, with_string, "unclear"),

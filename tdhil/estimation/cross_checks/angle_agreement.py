@@ -127,18 +127,18 @@ def angle_contradiction(recording: Recording) -> Refusal | None:
     for one in excited:
         if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:
             return Refusal(
-                f"the reported speed contradicts the shaft's angle: in {one.where} the angle moved {one.value:.4g}"
-                f" times as far as the reported speed says (±{one.half_width:.2g}, tolerance"
-                f" ±{SPEED_UNIT_TOLERANCE:g})",
+                f"the reported speed contradicts the shaft's angle. In {one.where} the angle moved "
+                f"{one.value:.4g} times as far as the integral of the reported speed (±{one.half_width:.2g}, "
+                f"tolerance ±{SPEED_UNIT_TOLERANCE:g})",
                 "check the unit of speed and the counts per turn in the profile, and the encoder's coupling",
                 entry=MessageCode.SPEED_SCALE_DOUBTFUL,
             )
         for other in (*steady, *excited):
             if abs(one.value - other.value) > _ALIKE * abs(other.value) + one.half_width + other.half_width:
                 return Refusal(
-                    "the reported speed changed its scale during the run: the angle moved "
-                    f"{one.value:.4g} ± {one.half_width:.2g} times as far as the reported speed says in {one.where},"
-                    f" and {other.value:.4g} ± {other.half_width:.2g} times as far in {other.where} before or after",
+                    "the scale of the reported speed changed during the run. The angle over the integral of the "
+                    f"reported speed is {one.value:.4g} ± {one.half_width:.2g} in {one.where} and "
+                    f"{other.value:.4g} ± {other.half_width:.2g} in {other.where}",
                     "check the encoder, its coupling and its supply, and which program writes to the drive; then run it"
                     " again", entry=MessageCode.SPEED_SCALE_DOUBTFUL,
                 )

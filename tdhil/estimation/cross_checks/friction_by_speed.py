@@ -149,8 +149,8 @@ class FrictionCurve:
         if not self.bent:
             return ()
         return (CodedText(
-            f"friction is no straight line over speed (p = {self.p_value:.1g}): its slope B differs by "
-            f"±{self.viscous_spread_nm_s_rad:.2g} N·m·s/rad from one mean speed to the other, and J knows less of it",
+            f"friction is not linear in speed (p = {self.p_value:.1g}): its slope B differs by "
+            f"±{self.viscous_spread_nm_s_rad:.2g} N·m·s/rad between the mean speeds. The interval of J includes this",
             MessageCode.FRICTION_NOT_LINEAR),)
 
 

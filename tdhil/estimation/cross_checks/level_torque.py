@@ -84,11 +84,10 @@ def level_contradiction(recording: Recording, samples: Samples) -> Refusal | Non
         if LEAST <= one.ratio <= MOST or apart <= _CLEAR_SDS * one.sd_nm:
             continue
         return Refusal(
-            f"the mean torque of stage 5 is {one.torque_nm:.4g} N·m at {one.speed_rad_s:.3g} rad/s, and the levels of"
-            f" stage 2 account for {one.by_levels_nm:.4g} N·m there ({one.ratio:.2f} times, limits {LEAST:g} to"
-            f" {MOST:g}): the scale of torque or the load changed during the run",
-            "check that torque is reported with one scale in all stages and that the load stays the same; then run it"
-            " again",
+            f"the mean torque of stage 5 is {one.torque_nm:.4g} N·m at {one.speed_rad_s:.3g} rad/s. The operating "
+            f"points of stage 2 give {one.by_levels_nm:.4g} N·m there (ratio {one.ratio:.2f}, limits {LEAST:g} to "
+            f"{MOST:g}). The torque scale or the load changed during the run",
+            "check that the torque scale and the load stay the same in all stages. Then repeat the run",
             MessageCode.TORQUE_AT_SPEED_CHANGED,
         )
     return None

@@ -141,12 +141,11 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
         wider = _bent_by(own, fit, confidence)
         if apart > _ALIKE * reference.value and _agrees(wider, finding, confidence, share) is False:
             return Refusal(
-                f"two routes through the same run contradict each other: J is {reference.value:.4g} kg·m² by the "
-                f"excitation and {own.value:.4g} ({printed_interval(own.low, own.high)}) kg·m² by the {opinion.route}; "
-                "a signal changed its scale during the run, the load changed, or friction is not what the model takes "
-                "it for",
-                "check that speed and torque are reported with one scale in all stages and that the load stays the same"
-                " during the run; then run it again", entry=MessageCode.METHODS_CONTRADICT,
+                f"two methods contradict each other: J is {reference.value:.4g} kg·m² by the excitation and "
+                f"{own.value:.4g} ({printed_interval(own.low, own.high)}) kg·m² by the {opinion.route}. The scale "
+                "of a signal or the load changed during the run, or friction differs from the model",
+                "check that the scales of speed and torque and the load stay the same in all stages. Then repeat "
+                "the run", entry=MessageCode.METHODS_CONTRADICT,
             )
     return Refusal("", "")
 
@@ -167,7 +166,7 @@ def _with_least_change(
     own = _bent_by(before[0][0].inertia_kg_m2, before[0][1], confidence)
     half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
     least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / compared) * half / reference.value)
-    note = f"{opinions[0].note}; a scale of speed or torque that changes at stage 5 shows from ±{least:.0%} on"
+    note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
     return (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
 
 

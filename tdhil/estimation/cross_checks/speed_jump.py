@@ -98,9 +98,9 @@ def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_k
         return None
     at = int(np.argmax(beyond))
     return Refusal(
-        f"at {time_s[at, 0]:.1f} s the reported speed went from {speed[at - back]:.2f} to {speed[at]:.2f} rad/s within"
-        f" {back * point_s:.2g} s, {abs(slope[at]):.2g} rad/s²: torque and string accelerate this shaft by"
-        f" {bound[at]:.2g} rad/s² at most, so a scale of the speed changed during the run",
+        f"at {time_s[at, 0]:.1f} s the reported speed jumped from {speed[at - back]:.2f} to {speed[at]:.2f} rad/s"
+        f" within {back * point_s:.2g} s ({abs(slope[at]):.2g} rad/s²). Torque and string accelerate this shaft by"
+        f" {bound[at]:.2g} rad/s² at most. The speed scale changed during the run",
         "check the encoder, its cable and its scale; then run it again", MessageCode.SPEED_JUMPED,
     )
 

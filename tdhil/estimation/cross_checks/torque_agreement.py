@@ -324,13 +324,13 @@ def _which(found: TorqueRatio) -> str:
     share = found.ratio.value / found.demanded_ratio
     tolerance = _FITS * abs(found.ratio.value - 1.0)
     if abs(found.demanded_ratio - 1.0) < tolerance:
-        return "; the demanded torque follows the commanded one, so the reported torque stands alone"
+        return "; the demanded torque agrees with the commanded one, but the reported torque does not"
     if abs(share - 1.0) < tolerance:
-        return "; demanded and reported torque fit each other, so the commanded torque stands alone"
-    return "; no two of the three fit each other"
+        return "; demanded and reported torque agree, but the commanded torque does not"
+    return "; no two of the three agree"
 
 
 def _advice(found: TorqueRatio) -> str:
     if found.reference == DEMANDED:
-        return f"{_ADVICE}; in torque mode the commanded torque would tell which of the two is wrong"
+        return f"{_ADVICE}. A run in torque mode shows which of the two is wrong"
     return _ADVICE

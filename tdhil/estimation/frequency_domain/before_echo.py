@@ -166,8 +166,8 @@ def unleaked(lines: tuple[SpectralLine, ...], fits: tuple[PeriodLines, ...]) -> 
 
 _LAGS_S = ((0.40, 0.15), (0.05, 0.05), (0.15, 0.40))       # s; start values of the lags of speed and torque
 _WORDS = ModelWords(
-    "a string whose echo may be anything",
-    "is the pipe as rig.yaml has it, from the top down to where its section changes?",
+    "a string with an unknown echo",
+    "check that rig.yaml describes the pipe from the top down to its first change of section",
     "excite for longer (--periods), or lift the bit off bottom",
 )
 
@@ -179,7 +179,7 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
     pipe, confidence = case.recording.pipe, case.options.confidence
     if pipe is None:
         raise Refused(
-            "pseudo-random torque tells the inertia above a drill string only if its pipe is known",
+            "pseudo-random torque needs the sizes of the pipe, and these are not stated",
             "state load.length_m and both diameters in rig.yaml, or use --excitation multisine",
             entry=MessageCode.ECHO_NOT_SEPARATED,
         )
@@ -210,9 +210,8 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
         finding,
         inertia=inertia,
         conditions=(
-            f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away within"
-            f" {_LASTS_S:g} s",
-            f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {tolerance}",
+            f"almost no echo returns within {shaft.echo_s:.2f} s, and each echo decays within {_LASTS_S:g} s",
+            f"the characteristic impedance of the pipe is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {tolerance}",
             *(() if answer is None else (_FOLLOWS,)),
             *of_reports(case.recording.lag_prior),
         ),
@@ -235,15 +234,15 @@ def problem_of(
     shaft = EchoShaft(pipe, max(hertz, default=1.0))
     if not 1.0 / apart >= shaft.echo_s + _LASTS_S:
         raise Refused(
-            f"the lines are {apart:.3g} Hz apart; to separate an echo after {shaft.echo_s:.2f} s they must be at most"
-            f" {1.0 / (shaft.echo_s + _LASTS_S):.3g} Hz apart",
+            f"the lines are {apart:.3g} Hz apart. An echo after {shaft.echo_s:.2f} s needs lines at most "
+            f"{1.0 / (shaft.echo_s + _LASTS_S):.3g} Hz apart",
             "use a lower --frequency, or --excitation multisine",
             entry=MessageCode.ECHO_NOT_SEPARATED,
         )
     if not max(hertz) * shaft.echo_s >= 1.0:
         raise Refused(
-            f"the echo comes back after {shaft.echo_s:.2f} s, before the fastest line, {max(hertz):.3g} Hz, has turned"
-            " once: the string is too short",
+            f"the string is too short: its echo returns after {shaft.echo_s:.2f} s, within the first period of "
+            f"the fastest line ({max(hertz):.3g} Hz)",
             "use --excitation multisine", entry=MessageCode.ECHO_NOT_SEPARATED,
         )
     model = Model(shaft)
@@ -273,7 +272,10 @@ _OWN_LAG_S, _OWN_LAG_SD_S = 0.01, 0.015      # s; lag of the torque behind its s
 _SHAPE_SD = 0.1             # sd of the report's shape about the measured one, of 0 to 0.5: the torque loop adds its own
 _ANSWER_MISFIT = 0.01       # of the lines, rms: above it the response is not a filter of two poles, and stays unknown
 _LEAST_ANSWER = 0.1         # of the strongest line: weaker lines are not used
-_FOLLOWS = "the drive's torque follows its setpoint within some 40 ms: what its report is late by beyond is its filter"
+_FOLLOWS = (
+    "the drive's torque follows its setpoint within some 40 ms; its filter causes any further delay of the reported"
+    " torque"
+)
 
 
 def torque_answer(recording: Recording, commanded_nm: FloatArray) -> TorqueAnswer | None:
@@ -403,9 +405,10 @@ def _budget(fitted: FittedModel, low: float, high: float, confidence: float, sca
         return half_width_first_order(fitted, INERTIA, confidence, known)
 
     grown = (
-        ("noise", half(VISCOUS, RESISTANCE, *echo, *lags), "scatter from period to period, the bit's noise in it"),
-        ("echo", half(VISCOUS, RESISTANCE, *lags), "what the bottom makes of a wave"),
-        ("string", half(*lags), "the pipe's resistance to waves, and the top's own friction"),
+        ("noise", half(VISCOUS, RESISTANCE, *echo, *lags), "scatter from period to period, with the noise of the "
+                                                           "bit"),
+        ("echo", half(VISCOUS, RESISTANCE, *lags), "unknown reflection at the bottom"),
+        ("string", half(*lags), "characteristic impedance of the pipe, and friction at the top"),
         ("lags", half(), "time constants of the reporting filters"),
         ("lag structure", 0.5 * (high - low), "filters of two poles, moving averages"),
     )

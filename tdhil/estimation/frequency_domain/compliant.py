@@ -510,17 +510,18 @@ def _budget(fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: flo
 
 _LOOK_FOR = "look for play, a bit that sticks, or friction that changes with speed or time"
 _OPEN = Refusal(
-    "the lines bend as those of a shaft that swings do, and leave its inertia open",
-    "excite with more amplitude, for longer, on both sides of the resonance",
+    "the excited lines show a load that swings, but do not determine its inertia",
+    "raise the amplitude, excite for more periods, and excite lines on both sides of the resonance",
 )
 _UNSEEN = Refusal(
-    "the rig's load is a string, and these lines do not tell the motor's inertia from what hangs below it",
-    "excite with more amplitude, for longer, from below the string's lowest swing to well above it",
+    "the rig's load is a string, and the excited lines do not separate its inertia from that of the motor",
+    "raise the amplitude, excite for more periods, and excite lines from below the lowest resonance of the "
+    "string to well above it",
 )
 _WIDE = "state the drive's speed and torque filters, or excite with more amplitude above the resonance"
 _WHICH = (
-    "say what swings, since a spring that weighs something isn't excluded: --model two-mass for a coupling or a shaft"
-    " that weighs next to nothing, --model string for a drill string; or excite with more amplitude above the resonance"
+    "add --model two-mass for a coupling or a light shaft, or --model string for a drill string; the data allow "
+    "both. Or raise the amplitude above the resonance"
 )
 
 
@@ -545,7 +546,7 @@ def identify_compliant(
             return Refusal(f"the rig's load is a string: {chosen.reason}", chosen.advice, chosen.entry)
         if contradicted is None:
             return rigid or chosen
-        advice = f"{contradicted.words.if_rejected}; {chosen.advice}, for a shaft that is not rigid to be identified"
+        advice = f"{contradicted.words.if_rejected}. If the load swings: {chosen.advice}"
         return replace(contradicted, words=replace(contradicted.words, if_rejected=advice))
     if result is None:
         if is_string and not rejects(chosen.fit.residual):
@@ -645,16 +646,16 @@ def _words(name: str) -> ModelWords:
 
 
 _OTHER_PIPE = CodedText(
-    "the data contradict the pipe's sizes in rig.yaml, which were left out of account: look at load.length_m and the"
-    " diameters",
+    "the data contradict the pipe's sizes in rig.yaml. tdhil did not use these sizes. Check load.length_m and "
+    "both diameters",
     MessageCode.OTHER_PIPE,
 )
 
 
 def _conditions(chosen: Chosen) -> tuple[str, ...]:
     if chosen.pipe is not None:
-        sizes = f"{chosen.pipe.source} says, to {100.0 * chosen.pipe.rel_sd:.2g} % (1 sd)"
-        shaft = f"the motor turns a uniform string whose pipe weighs and yields as {sizes}"
+        sizes = f"{chosen.pipe.source}, to {100.0 * chosen.pipe.rel_sd:.2g} % (1 sd)"
+        shaft = f"the motor turns a uniform string, its pipe as in {sizes}"
     elif chosen.fit.is_string:
         shaft = "the motor turns a uniform string"
     else:
@@ -669,15 +670,15 @@ def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
     if chosen.unlike_hz:
         where = ", ".join(f"{hz:.3g}" for hz in chosen.unlike_hz)
         said.append(CodedText(
-            "the load swings so widely that it answers otherwise at one mean speed than at another (it may turn"
-            f" back at the slower one): lines at {where} Hz count by that difference",
+            "the load responds differently at the two mean speeds; it may turn back at the slower one. tdhil "
+            f"includes this difference in the uncertainty of the lines at {where} Hz",
             MessageCode.LOAD_SWINGS_WIDELY))
     said += [CodedText(
-        "J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L",
+        "J is J_r, the inertia on the motor's side of the spring. A slow motion has to accelerate J_r + J_L",
         MessageCode.MOTOR_SIDE_ONLY)]
     if not _bounded(found.shaft.total_inertia):
         said.append(CodedText(
-            "J_r + J_L is left open on one side: a slower line, well below the resonance, would show it",
+            "the interval of J_r + J_L is open on one side. Excite a line well below the resonance to bound it",
             MessageCode.TOTAL_INERTIA_OPEN))
     hertz = [line.hertz for line in fit.fitted.problem.lines]
     for name, one in (("resonance", found.shaft.resonance_hz), ("antiresonance", found.shaft.antiresonance_hz)):
@@ -688,11 +689,12 @@ def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
                 MessageCode.RESONANCE_IN_BAND))
     if fit.fitted.problem.constraint is None:
         said.append(CodedText(
-            "only one mean speed: viscous friction rests on the lines, not on levels",
+            "the shaft was excited about one mean speed only. Viscous friction comes from the excited lines, not "
+            "from operating points",
             MessageCode.ONE_MEAN_SPEED))
     if not fit.fitted.first_order:
         said.append(CodedText(
-            "first-order lags do not explain the reports; filters of two poles and moving averages do",
+            "first-order lags do not explain the reported signals. Filters of two poles and moving averages do",
             MessageCode.LAGS_NOT_FIRST_ORDER))
     if fit.residual is not None and REJECT_P <= fit.residual.p_value < DOUBT_P:
         said.append(CodedText(

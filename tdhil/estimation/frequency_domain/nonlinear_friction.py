@@ -383,16 +383,16 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
         result = _result(found, constraint, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
-    finding = rigid_finding(result, case, "a rigid shaft whose friction is no straight line over speed")
+    finding = rigid_finding(result, case, "a rigid shaft with nonlinear friction")
     if isinstance(finding, Refusal):
         return None
     against = rigid.residual.p_value if rigid.residual is not None else 0.0
-    speak = "contradict" if rejects(rigid.residual) else "speak against"
+    speak = "contradict" if rejects(rigid.residual) else "cast doubt on"
     return replace(
         finding,
         model=MODEL,
         bent=True,
-        preface=f"the residuals {speak} straight friction (p = {against:.1g}); ",
+        preface=f"the residuals {speak} linear friction (p = {against:.1g}); ",
         warnings=(*finding.warnings, _bend_words(found[0], motion)),
     )
 
@@ -432,7 +432,7 @@ def _budget(
 
 def _bend_words(best: BentFit, motion: ShaftMotion) -> str:
     return CodedText(
-        f"friction is no straight line over speed: it bends {best.bend.words}, which is allowed for; B is its slope"
-        f" between the mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s",
+        f"friction is not linear in speed: it bends {best.bend.words}. The model includes this. B is its slope "
+        f"between the mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s",
         MessageCode.FRICTION_NOT_LINEAR,
     )

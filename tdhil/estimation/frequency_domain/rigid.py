@@ -167,8 +167,8 @@ def _around(value: float, half: float) -> Estimate:
 
 RIGID = "rigid+lags"
 _OPEN = Refusal(
-    "the data leave the inertia open: they do not separate it from the lags of the reported signals",
-    "excite with more amplitude at the lowest lines, for longer, and about two mean speeds",
+    "the data do not separate the inertia from the lags of the reported signals",
+    "raise the amplitude of the lowest lines, excite for more periods, and use two mean speeds",
 )
 
 
@@ -355,12 +355,12 @@ def of_reports(prior: LagPrior) -> list[str]:
 
 
 _TURNS_AS_ONE = CodedText(
-    "the rig's load is a string, but at these lines all turns as one: J is that of motor, string and what hangs below"
-    " it together, not the motor's alone",
+    "the rig's load is a string, and it turns together with the motor at these frequencies. J is the inertia of "
+    "motor, string and bit, not of the motor alone",
     MessageCode.STRING_MOVES_WITH_MOTOR)
 _MAY_STAY_BEHIND = CodedText(
-    "the rig's load is a string, and these lines do not show whether it turns with the motor: J is that of all that"
-    " turns there, which may be the motor alone",
+    "the rig's load is a string. These frequencies do not show whether it turns with the motor. J may be the "
+    "inertia of the motor alone",
     MessageCode.LOAD_MAY_STAY_BEHIND)
 
 
@@ -376,11 +376,12 @@ def _caveats(result: RigidResult, as_paper: bool, has_drill_string: bool) -> tup
         found.append(_TURNS_AS_ONE)
     if result.fitted.problem.constraint is None:
         found.append(CodedText(
-            "only one mean speed: viscous friction rests on the lines, not on levels",
+            "the shaft was excited about one mean speed only. Viscous friction comes from the excited lines, not "
+            "from operating points",
             MessageCode.ONE_MEAN_SPEED))
     if not as_paper and not result.first_order:
         found.append(CodedText(
-            "first-order lags do not explain the reports; filters of two poles and moving averages do",
+            "first-order lags do not explain the reported signals. Filters of two poles and moving averages do",
             MessageCode.LAGS_NOT_FIRST_ORDER))
     if result.residual is not None and doubtful(result.residual) and not rejects(result.residual):
         found.append(CodedText(

@@ -47,7 +47,7 @@ _TURNS = 2                 # changes of acceleration in one ramp
 _BLOCKS = 60              # blocks over which a signal is averaged
 
 ADVICE = (
-    "change the speed quickly and often, up and down, with the torque recorded all the while: steps or ramps of "
+    "change the speed quickly and often, up and down, and record the torque all the time. Use steps or ramps of "
     "different steepness between several speeds, or a multisine about two mean speeds"
 )
 
@@ -58,8 +58,17 @@ def check_signals(recording: Recording, samples: Samples) -> None:
     if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s or np.ptp(speed) == 0.0:
         raise Refused("the speed did not change", ADVICE, entry=MessageCode.NO_EXCITATION)
     if np.ptp(torque) <= 2.0 * recording.torque_resolution_nm or np.ptp(torque) == 0.0:
-        raise Refused("the torque did not change: a shaft that coasts shows how inertia and friction relate, not "
-                       "how large they are", "record the torque, and a motion that the drive's torque causes",
+        raise Refused("the torque did not change. Coasting gives only the ratio of inertia and friction", "move "
+                                                                                                          "the "
+                                                                                                          "shaft "
+                                                                                                          "by "
+                                                                                                          "the "
+                                                                                                          "drive's "
+                                                                                                          "torque, "
+                                                                                                          "and "
+                                                                                                          "record "
+                                                                                                          "this "
+                                                                                                          "torque",
                        entry=MessageCode.NO_EXCITATION)
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
@@ -89,22 +98,23 @@ def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
     torque = _blocks(samples.torque_nm)
     middle = float(np.max(np.abs(speed)))
     if np.ptp(speed) <= _STEADY_SHARE * middle:
-        raise Refused("the speed was constant: torque at one speed is friction, and tells nothing of the inertia",
+        raise Refused("the speed was constant. The torque then shows friction, not inertia",
                        ADVICE, entry=MessageCode.NO_EXCITATION)
     scatter = float(np.median(np.abs(np.diff(samples.torque_nm)))) + 1e-300
     moving = np.abs(speed) > _STEADY_SHARE * middle
     span = float(np.ptp(torque))
     if span <= 5.0 * scatter or np.mean(np.abs(torque[moving]) <= _IDLE_SHARE * span + scatter) > 0.5:
-        raise Refused("for most of the motion no torque was reported: a shaft that coasts shows how inertia and "
-                       "friction relate, not how large they are",
-                       f"add motion that the drive's torque causes: {ADVICE}", entry=MessageCode.NO_EXCITATION)
+        raise Refused("the torque was zero for most of the motion. Coasting gives only the ratio of inertia and "
+                      "friction",
+                       f"move the shaft by the drive's torque. {ADVICE[:1].upper()}{ADVICE[1:]}",
+                      entry=MessageCode.NO_EXCITATION)
     rates = np.diff(speed)
     fast = rates[np.abs(rates) > 0.25 * float(np.max(np.abs(rates)))]
     if np.count_nonzero(np.diff(np.sign(fast))) < _TURNS:
-        raise Refused("one change of speed leaves inertia, friction and the lags of the reported signals open: they "
-                       "explain each other", ADVICE, entry=MessageCode.NO_EXCITATION)
-    raise Refused("torque and speed don't tell the inertia apart from friction, the lags of the reported signals and "
-                   "the noise", ADVICE)
+        raise Refused("one change of speed does not separate inertia, friction and the lags of the reported "
+                      "signals", ADVICE, entry=MessageCode.NO_EXCITATION)
+    raise Refused("torque and speed do not separate the inertia from friction, noise and the lags of the "
+                  "reported signals", ADVICE)
 
 
 def _blocks(signal: FloatArray) -> FloatArray:
@@ -176,7 +186,8 @@ def identify_record(case: Case) -> Finding:
     """
     if not shaft_model(case.options.model).lags:
         raise Refused(
-            "the acceleration regression uses the reported signals; without periodic excitation nothing tests this",
+            "the acceleration regression assumes unfiltered signals. Without periodic excitation tdhil cannot "
+            "test this",
             "identify with the rigid model, which includes reporting lags",
         )
     check_signals(case.recording, case.samples)
@@ -284,10 +295,10 @@ def _caveats(solved: Solved) -> tuple[str, ...]:
     found = []
     if solved.bent:
         found.append(CodedText(
-            "friction is no straight line over speed: a part that grows with its square was fitted too",
+            "friction is not linear in speed. tdhil also fitted a part that grows with the square of the speed",
             MessageCode.FRICTION_NOT_LINEAR))
     if solved.shaped:
         found.append(CodedText(
-            "one-pole filters do not fit the reported signals; their structure was fitted too",
+            "first-order lags do not explain the reported signals. tdhil also fitted the structure of the filters",
             MessageCode.LAGS_NOT_FIRST_ORDER))
     return tuple(found)

@@ -45,10 +45,9 @@ def refuse_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: fl
     if seen is None:
         return
     raise Refused(
-        f"stick-slip: the shaft stood still {seen.jumps} times while torque rose by {seen.rise_nm:.3g} N·m,"
-        f" and then jumped; it was at standstill for {seen.still:.0%} of the record",
-        "turn faster, so that the shaft never stops, or use a stiffer speed loop: friction at standstill is larger"
-        " than in motion, and the speed loop does not hold the speed between them",
+        f"stick-slip: the shaft stopped {seen.jumps} times while the torque rose by {seen.rise_nm:.3g} N·m, and "
+        f"then jumped. It was at standstill for {seen.still:.0%} of the record",
+        "turn faster, so that the shaft never stops, or use a stiffer speed loop",
         entry=MessageCode.STICK_SLIP_RECORDED,
     )
 
