@@ -147,11 +147,11 @@ class Report:
 def _simulated(document: Part) -> str:
     if not (found := marks(document)):
         return ""
-    said = ["drive and rig are simulated, nothing real turned"] if document["simulated"] else []
+    said = ["drive and rig are simulated, no real shaft turned"] if document["simulated"] else []
     if faults := ", ".join(document.get("rehearsed_faults") or ()):
-        said.append(f"rehearsed: {faults}. This result is no history of the rig")
+        said.append(f"rehearsed: {faults}. The history of the rig does not include this result")
     if document.get("uploaded"):
-        said.append("tdhil serve did not make this recording. It was uploaded, and is no history of a rig")
+        said.append("tdhil serve did not make this recording. It was uploaded, and no history of a rig includes it")
     return f"{found}: {'; '.join(said)}"
 
 

@@ -98,7 +98,7 @@ def laboratory_page(
     return Report(
         title=f"Calibration of a drive's {quantity}",
         subtitle=shown_date(document["date"]),
-        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        simulated=f"{SIMULATED}: drive and rig are simulated, no real shaft turned" if document["simulated"] else "",
         answer=AnswerBox(
             VERDICT_COLOUR.get(document["verdict"], "yellow"),
             "No number" if factor is None else f"κ = {with_share(factor, '')}", tuple(lines), document["verdict"],

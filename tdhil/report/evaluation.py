@@ -117,7 +117,7 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     loop = document["loop"]
     yield "unknown torque", f"{loop['unknown_rms_nm']:.0f} N·m rms; {loop['put_in_j']:.0f} J by the loop's errors"
     if document["bit"]:
-        yield "bit", f"{document['bit']}: all of this holds for it alone"
+        yield "bit", f"{document['bit']}: the results are valid for this bit only"
     yield "log", document["log"]
 
 
@@ -126,15 +126,15 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 _COLOURS = {"as_predicted": "green", "differs": "yellow"}
 _VERDICTS = {
-    "as_predicted": "as predicted: the drive does with this string what tune says",
-    "differs": "differs from what tune says",
-    "not_found": "not found: there is no critical speed to tell",
-    "invalid": "invalid: what turned was not the string",
+    "as_predicted": "as predicted: drive and string behave as computed by tune",
+    "differs": "differs from the prediction of tune",
+    "not_found": "not found: the run shows no critical speed",
+    "invalid": "invalid: the shaft did not move like the string",
 }
 _CLOSE_S = 60.0
 _CLOSE = (
     (Phase.HOLD, 5.0, "At the first set speed the bit must stick and slip."),
-    (Phase.RELEASED, 35.0, "The bit turns; it is lifted off bottom, and what swings decays."),
+    (Phase.RELEASED, 35.0, "The bit turns; it is lifted off bottom, and the oscillation decays."),
 )
 """Phases shown in detail, for `_CLOSE_S`, from so many seconds before."""
 
@@ -152,7 +152,7 @@ def write_evaluation_report(
 def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:
     """Return the blocks of the page."""
     facts = [document["string"] or "a virtual string", shown_date(document["date"])]
-    sections = [ReportSection("Measured, and as tune says", (
+    sections = [ReportSection("Measured and predicted by tune", (
         Table((Column("", 0.34), Column("measured", 0.33, number=True), Column("by tune", 0.33, number=True)),
               tuple(_beside(document))),
     ))]
@@ -180,9 +180,9 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
     return Report(
         title="Speed controller on a virtual drill string",
         subtitle=" · ".join(fact for fact in facts if fact),
-        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        simulated=f"{SIMULATED}: drive and rig are simulated, no real shaft turned" if document["simulated"] else "",
         answer=_answer(document),
-        warnings=() if document["complete"] else ("The run was cut short: this is what there is of it.",),
+        warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
         sections=tuple(sections),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
         reference=reference_of(document),
@@ -217,7 +217,7 @@ def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
 def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     loop, rig, law = document["loop"], document["rig_at_motor"], document["controller"]["at_main_shaft"]
     if document["bit"]:
-        yield "bit", f"{document['bit']}: all of this holds for it alone"
+        yield "bit", f"{document['bit']}: the results are valid for this bit only"
     yield "meant", f"{document['meant_inertia_kg_m2']:.4g} kg·m² at the main shaft"
     if law["compensated_kg_m2"]:
         yield "inertia compensated", f"{law['compensated_kg_m2']:.4g} kg·m²"

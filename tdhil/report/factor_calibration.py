@@ -209,7 +209,8 @@ def _pairs_rows(document: Part) -> Iterator[tuple[str, str]]:
 
 def _scatter(document: Part) -> str:
     return f"p = {document['scatter']['p_value']:.2g}" + (
-        f"; {document['spread']:.2g} times as much as stated, and counted so" if document["spread"] > 1.0 else "")
+        f"; {document['spread']:.2g} times as much as stated; the uncertainties include this"
+        if document["spread"] > 1.0 else "")
 
 
 def _hysteresis(document: Part) -> str:
@@ -241,7 +242,7 @@ def _alignment(document: Part) -> Iterator[tuple[str, str]]:
 
 def _known_pipe_rows(document: Part) -> Iterator[tuple[str, str]]:
     pipe = document["pipe"]
-    yield "pipe as stated", (f"{pipe['impedance_nm_s_rad']:.4g} N·m·s/rad; a wave takes {pipe['delay_s']:.4g} s to its"
+    yield "pipe as stated", (f"{pipe['impedance_nm_s_rad']:.4g} N·m·s/rad; travel time {pipe['delay_s']:.4g} s to its"
                              " end")
     if pipe["measured_impedance_nm_s_rad"] is not None:
         yield "measured", (f"{pipe['measured_impedance_nm_s_rad']:.4g} N·m·s/rad in the drive's unit;"

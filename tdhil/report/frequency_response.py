@@ -42,9 +42,9 @@ def response_sentences(found: Part) -> tuple[str, ...]:
     if known:
         open_lines = len(halves) - len(known)
         said.append(f"|ω/T| is known to ±{min(known):.2g} % at the best and ±{max(known):.2g} % at the worst of "
-                    f"{len(lines)} lines" + (f"; {open_lines} drown in noise." if open_lines else "."))
+                    f"{len(lines)} lines" + (f"; {open_lines} are below the noise." if open_lines else "."))
     else:
-        said.append("All lines drown in noise: raise --amplitude or --periods.")
+        said.append("All lines are below the noise. Raise --amplitude or --periods.")
     harmonics, speeds = len(distortion["harmonics"]), len(found["mean_speeds_rad_s"])
     where = " and ".join(text for text, there in (
         (f"{harmonics} unexcited harmonics", distortion["by_harmonics"] is not None),

@@ -40,7 +40,7 @@ _EXPLAINED = {
                       f"stick-slip, {AT_RISK_INDEX:g} and more is at risk",
     "downhole speed": "from torque and speed at the top by the two travelling waves; ± is half of peak to peak",
     "string torque": "T − J α at the top of the string",
-    "|r|": "share of a wave from below that the top drive sends back: 1 is a wall, 0 takes it all",
+    "|r|": "share of a wave from below that the top drive sends back: 1 reflects completely, 0 absorbs completely",
     "bit noise": "random torque of the bit in steady rotation; tdhil tune --bit-noise uses it",
     "in brackets": "95 % interval over J, length, shear modulus and wear of the string",
 }
@@ -219,8 +219,8 @@ def severity_report(document: Part, found: Sequence[Severity]) -> Report:
         sections=(
             ReportSection("Figures", (Table((Column("", 0.2), *(Column(name, width) for name in names)), rows),)),
             ReportSection("Over time", tuple(pictures)),
-            ReportSection("What the figures mean", (Pairs(tuple(_EXPLAINED.items())),)),
-            ReportSection("What it rests on", (Pairs((
+            ReportSection("Meaning of the figures", (Pairs(tuple(_EXPLAINED.items())),)),
+            ReportSection("Basis of the result", (Pairs((
                 ("J, main shaft", f"{document['inertia_kg_m2']['value']:.4g} kg·m² "
                  f"({printed_interval(document['inertia_kg_m2']['low'], document['inertia_kg_m2']['high'])})"),
                 ("string", f"ζ {document['string']['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after "

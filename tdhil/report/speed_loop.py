@@ -452,7 +452,7 @@ def loop_report(document: Part) -> Report:
                  "hard-wired stop in reach."),
         )))
     tuned_for = document["tuned_for"]
-    sections.append(ReportSection("What it rests on", (Pairs((
+    sections.append(ReportSection("Basis of the result", (Pairs((
         *_rests_on(document), ("from", tuned_for["source"]), ("model", tuned_for["model"]),
         ("profile", tuned_for["profile"] or "none"))),)))
     worst = tuned["worst"]

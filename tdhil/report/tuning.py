@@ -71,7 +71,7 @@ _EXPLAINED = {
     "gain margin": "change of all gains that makes the loop unstable; 6 dB is a factor of 2",
     "dead time": "further dead time in the loop that makes it unstable",
     "a, φ": "softness and frequency factor: P = ζ/a, I = (φω)² (J − J_c)",
-    "|r|, mean": f"share of a wave that the top sends back, 1 is a wall: at the lowest mode, and over "
+    "|r|, mean": f"share of a wave that the top reflects (1: completely): at the lowest mode, and over "
                  f"{BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz",
     "damping": "damping ratio of the least damped of the lowest modes",
     "J wrong": "damping and critical speed without noise if J is believed wrongly by as much",
@@ -140,7 +140,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
                for one in taken if one.controller is not None},
         },
         "critical_speeds": None if search is None else {
-            "meant": dict(_MEANT), "bit": "as stated in string.bit: they hold for it alone",
+            "meant": dict(_MEANT), "bit": "as stated in string.bit; valid for this bit only",
             "resolution_rpm": search.resolution_rpm, "highest_rpm": search.highest_rpm,
             "start_ramp_rpm_s": search.start_ramp_rpm_s,
             "under_noise": {
@@ -509,10 +509,10 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
               if one["margins"] and one["margins"]["failed"]),
             *(Text(f"{one['kind']} refused: {one['refused']}") for one in document["controllers"] if one["refused"]),
         )),
-        ReportSection("What the top drive sends back up the string", (
+        ReportSection("Reflection of the top drive", (
             Picture("reflection", partial(draw_reflection, document=document), 2.6,
-                    "|r(f)| at the top of the string: 1 is a wall, 0 swallows every wave. Dotted: the string's modes "
-                    "with the top held."),
+                    "|r(f)| at the top of the string: 1 reflects a wave completely, 0 absorbs it. Dotted: the string's "
+                    "modes with the top held."),
         )),
         ReportSection("Modes and their damping", (
             Picture("modes", partial(draw_modes, document=document), 2.3,
@@ -539,7 +539,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     rests: list[tuple[str, str]] = list(_rests_on(document))
     rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
     rests += _legend(document)
-    sections.append(ReportSection("What it rests on", (Pairs(tuple(rests)),)))
+    sections.append(ReportSection("Basis of the result", (Pairs(tuple(rests)),)))
     simulated = document["tuned_for"]["simulated"]
     return Report(
         title="Speed controller and drill string",

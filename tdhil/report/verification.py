@@ -161,10 +161,10 @@ def verification_report(document: Part, sha256: str = "") -> Report:
     return Report(
         title="Speed loop of the drive, verified",
         subtitle=" · ".join(fact for fact in facts if fact),
-        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        simulated=f"{SIMULATED}: drive and rig are simulated, no real shaft turned" if document["simulated"] else "",
         answer=AnswerBox(_COLOURS.get(verdict, "red"), verdict.replace("_", " ").capitalize(), (),
                          _VERDICTS[verdict], f"{document['reason']}.", document["next_step"]),
-        warnings=() if document["complete"] else ("The run was cut short: this is what there is of it.",),
+        warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
         sections=tuple(sections),
         footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
         reference=reference_of(document),
