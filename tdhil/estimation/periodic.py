@@ -108,8 +108,8 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         return replace(case, lines=every, usable=every, sound=True)
     lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
     if not lines:
-        raise _too_few(case, "no excited line is above the scatter", "raise the amplitude, or excite for more "
-                                                                     "periods")
+        raise _too_few(
+            case, "no excited line is clearly above the scatter", "raise the amplitude, or excite for more periods")
     warnings = case.warnings
     if len(lines) < len(every):
         warnings = (*warnings, CodedText(
