@@ -128,7 +128,7 @@ def test_without_noise_the_inertia_is_the_true_one(friction):
     assert said.model == MODEL, said.reason
     assert said.inertia.value == pytest.approx(104.0, rel=1e-3)
     assert said.inertia.low <= 104.0 <= said.inertia.high
-    assert "contradict straight friction" in said.reason
+    assert "contradict linear friction" in said.reason
     assert said.coulomb_nm is None
     assert sum("friction is not linear in speed" in text for text in said.warnings) == 1
     total = np.sqrt(sum(line.half_width_kg_m2**2 for line in said.budget if line.source != "torque scale"))

@@ -92,7 +92,7 @@ def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
     assert found.inertia.value == pytest.approx(plant.motor, rel=0.01)
     assert found.inertia.low <= plant.motor <= found.inertia.high
     assert found.inertia.high - found.inertia.low <= free.inertia.high - free.inertia.low
-    assert any("as rig.yaml says, to 3 %" in one for one in found.inertia.conditional_on)
+    assert any("its pipe as in rig.yaml, to 3 %" in one for one in found.inertia.conditional_on)
     assert any("contradict the pipe's sizes in rig.yaml" in warning for warning in wrong.warnings)
     assert wrong.inertia.low <= plant.motor <= wrong.inertia.high
 
