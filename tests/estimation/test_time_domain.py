@@ -359,7 +359,7 @@ def at_the_limit(r):
     return replace(r, torque_limit_nm=200.0)
 
 
-HOPELESS = [(constant_speed, "constant"), (coasting, "coast"), (no_torque, "torque did not change"),
+HOPELESS = [(constant_speed, "constant"), (coasting, "Coasting"), (no_torque, "torque did not change"),
             (standing, "speed did not change"), (slow_ramp, "one change of speed"), (only_noise, ""), (unrelated, ""),
             (turned_round, ""), (at_the_limit, "limit")]
 
