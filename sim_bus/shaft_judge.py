@@ -42,7 +42,7 @@ EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 12, 130, 143})
 """Exit codes of `tdhil.errors`, except 1 (an internal error) and 2 (an impossible request)."""
 
 _REMOVED = "torque removed"
-_STANDSTILL = ("shaft at standstill", "shaft at rest")
+_STANDSTILL = "shaft at standstill"
 _STANDS = ("valid", "valid_wide")
 
 
@@ -115,7 +115,7 @@ def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_
     words = " ".join(said.split())
     inertia, error = document.get("inertia_kg_m2") or {}, document.get("error") or {}
     seen = re.search(r"at standstill \(seen at ([\d.]+) s\)", words)
-    confirmed = any(text in words for text in _STANDSTILL) or seen is not None
+    confirmed = _STANDSTILL in words or seen is not None
     return ProcessOutcome(
         code, confirmed, float(seen[1]) if seen else None, document.get("verdict"),
         inertia.get("low_total", -inf), inertia.get("high_total", inf), _REMOVED in words.lower(), log_closed,

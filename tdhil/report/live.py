@@ -285,7 +285,7 @@ class LiveDisplay:
 
     def stopped(self, confirmed: bool) -> None:
         """Show the end of the stop sequence."""
-        end = "shaft at rest, drive disabled" if confirmed else "STOP NOT CONFIRMED"
+        end = "shaft at standstill, drive disabled" if confirmed else "STOP NOT CONFIRMED"
         self._view = replace(self._view, end=end)
         if not self._console.is_terminal:
             self._print(f"{self._prefix()}{end}")

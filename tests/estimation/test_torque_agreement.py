@@ -198,8 +198,8 @@ def turned(runs):
 @pytest.mark.heavy
 def test_an_angle_that_fits_changes_nothing(turned):
     with_angle = identify(turned)
-    assert with_angle.harmonics == ()
-    assert replace(with_angle, harmonics=None) == identify(replace(turned, position_rad=None))
+    assert with_angle.harmonics == with_angle.backlash == ()
+    assert replace(with_angle, harmonics=None, backlash=None) == identify(replace(turned, position_rad=None))
 
 
 @pytest.mark.heavy

@@ -146,7 +146,7 @@ def test_lines_come_in_order_and_before_it_is_left():
         whole_run(display, cycles=3)
     assert [line for line in shown.getvalue().splitlines() if line] == [
         "stage setup …", "a line", "stage setup ok, 1 s", "stage speed …", "a line", "stage speed ok, 1 s",
-        "shaft at rest, drive disabled",
+        "shaft at standstill, drive disabled",
     ]
 
 
@@ -179,7 +179,7 @@ def test_on_a_terminal_the_last_picture_is_that_of_the_end():
     with LiveDisplay(Console(file=shown, force_terminal=True, width=100), show_preflight=False) as display:
         whole_run(display, cycles=3)
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())       # what is left once the cursor is back
-    assert text.rstrip().splitlines()[-1].startswith("shaft at rest")
+    assert text.rstrip().splitlines()[-1].startswith("shaft at standstill")
     assert text.endswith("\n")
 
 

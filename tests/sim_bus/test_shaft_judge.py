@@ -102,7 +102,7 @@ def test_a_shaft_is_read_from_a_trace(tmp_path):
 
 @pytest.mark.parametrize(("document", "said", "expected"), [
     ({"verdict": "valid", "inertia_kg_m2": {"low_total": 99.0, "high_total": 108.0}},
-     "SIMULATED shaft at rest, drive\ndisabled", (True, None, "valid", 99.0, False)),
+     "SIMULATED shaft at standstill, drive\ndisabled", (True, None, "valid", 99.0, False)),
     ({"error": {"message": "no feedback"}},
      "tdhil: the shaft is at standstill (seen at 13.4 s) and the drive is disabled",
      (True, 13.4, None, -np.inf, False)),
