@@ -27,11 +27,11 @@ class MessageCode(Enum):
     # --- 0xx: a result with a number, and its warnings ---------------------------------------------------------------
     VALID = (
         1, "The result is valid",
-        "One model fits the data, and the half-width of its coverage interval is within --tolerance.",
-        "Use the result. A torque calibration makes the interval narrower.")
+        "One model fits the data, and the repeatability is within --tolerance.",
+        "Use the result. A torque calibration reduces the uncertainty of the torque scale.")
     VALID_WIDE = (
         2, "The result is valid, but its interval is wide",
-        "The half-width of the coverage interval, or of the repeatability, exceeds --tolerance.",
+        "The half-width of the repeatability exceeds --tolerance. The intervals are valid.",
         "Follow the advice beside the verdict, or raise --tolerance.")
     RESULT_WARNING = (
         20, "Warning about a result",

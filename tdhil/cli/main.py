@@ -36,7 +36,7 @@ _GROUPS: Final = {
         "identify": "move the shaft and identify its moment of inertia",
         "stop": "stop a drive without a run; this is no emergency stop",
     },
-    "look again": {
+    "evaluate logs": {
         "replay": "identify again, from a log or from a CSV trace",
         "frf": "show the frequency response with intervals and distortion",
         "compare": "compare runs: settings, inertias and whether they differ",
@@ -55,7 +55,7 @@ _GROUPS: Final = {
         "profiles": "show known drives, their settings and what is verified",
         "calibrate": "compute the scale of torque or speed from known quantities",
     },
-    "what J is for": {
+    "use J": {
         "tune": "compute gains: of the speed loop, or against stick-slip",
         "evaluate": "test a tuned controller on the drive with a virtual string",
         "severity": "show stick-slip in a record of ordinary drilling",

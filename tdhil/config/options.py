@@ -292,12 +292,12 @@ class RunOptions:
     tolerance: float = option(
         "--tolerance", "run.tolerance", 0.05, group=Topic.RESULT, common=True, unit=SHARE, metavar="SHARE", api=True,
         gt=0, lt=1,
-        form=Form("Tolerance: half-width of the interval, ± % of J", ("run", "replay", "upload"), PERCENT),
-        asked_again="largest half-width of a valid result",
+        form=Form("Tolerance: half-width of the repeatability, ± % of J", ("run", "replay", "upload"), PERCENT),
+        asked_again="largest half-width of the repeatability",
         help="acquire until the half-width of the repeatability is this share of J, such as 1% or 0.01",
         more="largest half-width, as a share of J (`0.01`; on the command line `1%` too). If it is given, stage 5 "
-             "continues until the repeatability is this narrow. The verdict is `valid_wide` if the repeatability, or "
-             "the whole interval with the torque scale, is wider",
+             "continues until the repeatability is this narrow. The verdict is `valid_wide` if the repeatability is "
+             "wider. The torque scale does not count",
     )
     max_time_s: float | None = option(
         "--max-time", "run.max_time_s", group=Topic.MOTION, common=True, unit=TIME, metavar="TIME", api=True, ge=1e-6,
