@@ -167,6 +167,10 @@ class StopTimeout:
         no_gain_s = self.waited_s - self._gained_s
         return self.waited_s > LONGEST_S or (self.waited_s > self._enough_s and no_gain_s > BLOCKS * BLOCK_S)
 
+    def ends(self, coasts_s: float) -> bool:
+        """Return whether the wait ends for a shaft that may coast for ``coasts_s`` more, s."""
+        return self.over and (coasts_s <= 0.0 or self.waited_s > LONGEST_S)
+
     def wait(self, period_s: float) -> None:
         """Count a cycle."""
         self.waited_s += period_s
@@ -345,7 +349,7 @@ class StopSequence:
         came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._loop.period_s
         patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
         since_s, held_nm = 0.0, self._torque_held_nm()
-        while not patience.over or self._loop.guard.observer.coasts_s > 0.0:
+        while not patience.over:
             speed = math.copysign(max(0.0, abs(speed) - step), came_from)
             sample = self._exchange(Command(Mode.SPEED, speed, held_nm))
             since_s += self._loop.period_s
@@ -551,7 +555,7 @@ class StopSequence:
         """
         rest = Standstill(self._loop.guard.observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
         patience = StopTimeout(self._enough_s + rest.settle_s, self._at_rest_rad_s)
-        while not patience.over or self._loop.guard.observer.coasts_s > 0.0:
+        while not patience.over:
             sample = self._exchange(_NO_TORQUE_ASKED)
             if sample is None:
                 if self._silent >= self._enough_silent:
@@ -608,7 +612,7 @@ class StopSequence:
         rest = Standstill(observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
         patience = StopTimeout(self._enough_s + rest.settle_s - self._settle_s, self._at_rest_rad_s)
         braking = Slowing(self._at_rest_rad_s, self._unmoved_s)
-        while not patience.over or self._loop.guard.observer.coasts_s > 0.0:
+        while not patience.ends(observer.coasts_s):
             asked = asked or self._ask(self._loop.drive.quick_stop)
             sample = self._exchange(_REST, or_poll=True)
             if sample is None:

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tdhil.runner.stop import LONGEST_S, StopTimeout
 from tests.runner.fake_drive import PERIOD_S, FakeDrive
 from tests.runner.stop_calls import LAG_S
 
@@ -38,3 +39,16 @@ def test_cycles_without_feedback_count_as_time(world):
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=(drive.cycles - begun) % 3 == 0)
     here.stop_sequence().run()
     assert here.bench.now_s - begun_s == pytest.approx(19.0, abs=0.2)
+
+
+def test_a_shaft_that_may_coast_is_waited_for_and_not_for_ever():
+    patience = StopTimeout(5.0, 0.05)
+    ended_s = {}
+    while len(ended_s) < 2 and patience.waited_s < 2.0 * LONGEST_S:
+        patience.see(0.0, 0.5)
+        for coasts_s in (0.0, 1.0):
+            if patience.ends(coasts_s):
+                ended_s.setdefault(coasts_s, patience.waited_s)
+    # two blocks without a lower speed end the usual wait; feedback that stays away must not make it endless
+    assert ended_s[0.0] < 20.0
+    assert ended_s[1.0] == pytest.approx(LONGEST_S, abs=1.0)
