@@ -105,6 +105,7 @@ SUBJECTS = {
         for name in ("observer", "momentum_balance", "position_way", "repeated_feedback", "revival", "runaway",
                      "shaft_bounds", "torque_following", "unanswered_torque")
     },
+    "observer/left_operation": _run("observer/left_operation", "test_left_operation.py", "test_stop_doubt.py"),
     "standstill": _run("standstill", "test_standstill.py", "test_stop_feedback.py"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
     "steady": _run("stages/steady", "test_steady.py", "test_swinging_string.py"),
@@ -165,6 +166,8 @@ SUBJECTS = {
         "test_cia402_without_bus.py", "test_torque_offset.py",
     ),
     "angle": _driver("angle", "test_angle_in_cycle.py"),
+    "standstill of a bare stop": _driver("standstill", "test_standstill.py", "test_quick_stop.py", "test_modbus_quick_stop.py"),
+    "canopen/bounded_send": _driver("canopen/bounded_send", "test_bounded_send.py"),
     "bare stop": _driver(
         "quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py", "test_quick_stop.py", "test_stop_table.py"
     ),

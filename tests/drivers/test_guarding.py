@@ -173,7 +173,7 @@ def test_a_drive_without_life_guarding_is_refused(run):
     run.drive.connect()
     found = run.drive.preflight(run.bench.limits)
     assert [check.name for check in found.refused] == ["watchdog"]
-    assert "host that dies" in found.refused[0].next_step
+    assert "if the host fails" in found.refused[0].next_step
     assert found.refused[0].where == "100Dh"
 
 

@@ -31,7 +31,7 @@ CASES = (
     Case(36, "encoder-inverted", 4, ("sign probe", "turned backwards", "encoder wiring"), notice_s=7.0),
     Case(45, "write-not-kept", 4, ("6080h", "speed limit: required"), "refused"),
     Case(45, "reads-back-otherwise", 4, ("6072h", "torque limit: required 400"), "refused"),
-    Case(50, "watchdog-not-armed", 4, ("0400h, 0420h", "watchdog: required", "leave the shaft turning"), "refused"),
+    Case(50, "watchdog-not-armed", 4, ("0400h, 0420h", "watchdog: required", "keeps turning"), "refused"),
     Case(82, "mode-lost" + IN_MOTION, 6, ("left its mode", "another master"), notice_s=0.6),
     Case(115, "sensor-lost" + IN_MOTION, 8, (*CONTRADICT, "encoder"), "coasts"),
     Case(116, "speed-lost" + IN_MOTION, 6, (*CONTRADICT, "encoder"), notice_s=0.3),

@@ -42,7 +42,7 @@ CASES = (
     Case(36, "encoder-inverted", 4, ("sign probe", "turned backwards", "encoder wiring"), notice_s=7.0),
     Case(45, "write-not-kept", 4, ("6080h", "speed limit: required"), "refused"),
     Case(45, "reads-back-otherwise", 4, ("6072h", "torque limit: required 400"), "refused"),
-    Case(50, "watchdog-not-armed", 4, ("1016h:1", "watchdog: required", "leave the shaft turning"), "refused"),
+    Case(50, "watchdog-not-armed", 4, ("1016h:1", "watchdog: required", "keeps turning"), "refused"),
     Case(115, "sensor-lost" + IN_MOTION, 8, (*CONTRADICT, "encoder"), "coasts", confirmed=False),
     Case(115, "sensor-lost@torque+3s", 8, (*CONTRADICT, "encoder"), notice_s=1.5, confirmed=False),
     Case(115, "sensor-frozen@acquire+2s", 8, (*CONTRADICT, "encoder"), "coasts", confirmed=False,
