@@ -166,7 +166,9 @@ SUBJECTS = {
         "test_cia402_without_bus.py", "test_torque_offset.py",
     ),
     "angle": _driver("angle", "test_angle_in_cycle.py"),
-    "standstill of a bare stop": _driver("standstill", "test_standstill.py", "test_quick_stop.py", "test_modbus_quick_stop.py"),
+    "standstill of a bare stop": _driver(
+        "standstill", "test_standstill.py", "test_quick_stop.py", "test_modbus_quick_stop.py",
+    ),
     "canopen/bounded_send": _driver("canopen/bounded_send", "test_bounded_send.py"),
     "bare stop": _driver(
         "quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py", "test_quick_stop.py", "test_stop_table.py"
