@@ -110,8 +110,12 @@ def test_a_socketcand_server_that_reads_nothing_ends_the_send():
         bus = Greeted("can0", host, number)
         other, _ = server.accept()
         with closing_in_the_end(other.close):
-            error = fill(CanLink(bus, MonotonicClock()))
+            link = CanLink(bus, MonotonicClock())
+            error = fill(link)
         assert "TimeoutError" in causes(error) and "did not accept a frame" in error.what
+        with pytest.raises(CommunicationLost) as nothing:      # a part of a frame may be on its way
+            link.send(0x201, bytes(8))
+        assert nothing.value.__cause__ is None
         bus.shutdown()
         other.close()
 

@@ -48,3 +48,17 @@ def test_a_shaft_that_still_turns_has_not_been_stopped():
     left = LeftOperation(point(0.0, 2.0, 0.0))
     left.see(point(0.5, 1.0, -100.0), turns=True)
     assert not left.braked(J_KG_M2)
+
+
+def test_nothing_is_known_before_the_next_point():
+    assert not LeftOperation(point(0.0, 2.0, 0.0)).braked(J_KG_M2)
+
+
+def test_the_torque_that_still_drives_is_no_braking_and_the_speed_counts_at_its_largest():
+    """The report lags: after the fault it still shows torque in the direction of motion, and a speed that rises."""
+    left = LeftOperation(point(0.0, 1.0, 0.0))
+    for at, speed, impulse in ((0.2, 2.0, 40.0), (0.6, 1.0, 25.0), (1.0, 0.0, 10.0)):
+        left.see(point(at, speed, impulse), turns=speed > 0.2)
+    assert left.speed_rad_s == 2.0
+    assert left.braked(30.0 / (0.1 * 2.0))                    # 30 N·m·s from the largest impulse on
+    assert not left.braked(31.0 / (0.1 * 2.0))
