@@ -143,6 +143,33 @@ class ReportingFilters:
     source: str = ""
 
 
+@dataclass(frozen=True)
+class ReportedSetting:
+    """One parameter of the drive's speed loop, as read in preflight."""
+
+    title: str                         # the manual's number and name
+    where: str                         # object or register
+    raw: float                         # counts
+    value: float                       # in `unit`
+    unit: str                          # as in the profile's ``speed_controller``
+    confidence: str                    # of that entry
+
+
+@dataclass(frozen=True)
+class SpeedLoopPresent:
+    """Gains of the drive's own speed loop before the run, at the motor shaft; None if the drive does not report one.
+
+    A reported setting has no value in SI if its unit is a share, or is unknown.
+    """
+
+    gain: ReportedSetting | None = None
+    integral: ReportedSetting | None = None
+    filter: ReportedSetting | None = None
+    gain_nm_s_rad: float | None = None     # P
+    integral_nm_rad: float | None = None   # I
+    filter_s: float | None = None          # time constant of the filter of the speed
+
+
 class Outcome(Enum):
     """Result of a preflight check."""
 
@@ -179,6 +206,7 @@ class Preflight:
     watchdog_s: float                  # 0: none is armed
     safe_action: str                   # reaction of the drive to a silent host
     filters: ReportingFilters = ReportingFilters()
+    speed_loop: SpeedLoopPresent | None = None   # None: the profile names no parameter of it that is read
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
     torque_offset_resolution_nm: float = 0.0     # one count of the torque offset; 0: not requested, or there is none
     kept_torque_nm: float | None = None          # the drive's own limit, if it was tighter and stayed

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from profiles.eds_reader import read_eds as read_eds
     from profiles.entry import (
         Confidence as Confidence, DriveProfile as DriveProfile, ProfileEntry as ProfileEntry, Require as Require,
-        SpeedControllerParameters as SpeedControllerParameters,
+        NotchParameter as NotchParameter, SpeedControllerParameters as SpeedControllerParameters,
     )
     from profiles.errors import (
         DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError, UsageError as UsageError,
@@ -44,7 +44,7 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "eds_import": "begin_profile",
         "eds_reader": "read_eds",
-        "entry": "Confidence DriveProfile ProfileEntry Require SpeedControllerParameters",
+        "entry": "Confidence DriveProfile NotchParameter ProfileEntry Require SpeedControllerParameters",
         "errors": "DataFileError Problem TdhilError UsageError",
         "library": "Profile eds_path load_canopen_profile load_ethercat_profile load_modbus_profile load_profile "
                    "matching_names parse_profile profile_names profile_text",

@@ -315,6 +315,7 @@ class Cia402Profile(DriveProfile):
         ]
         wanted: list[tuple[str, str | None]] = [("speed.times", name) for name in self.speed.times]
         wanted += [("speed.over", name) for name in self.speed.over]
+        wanted += self._speed_controller_names()
         for number, one in enumerate(self.parameters):
             wanted += [(f"parameters.{number}.times", one.times), (f"parameters.{number}.from_speed", one.from_speed)]
         findings += [(at, f"no parameter '{name}'") for at, name in wanted if name is not None and name not in names]

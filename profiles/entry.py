@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from profiles.errors import UsageError
 from profiles.messages import MessageCode
-from profiles.model import DataModel, refuse_if
+from profiles.model import DataModel, Finding, refuse_if
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Required value of a drive's setting before a shaft may turn. The keys are the same on every bus.
@@ -47,7 +47,14 @@ class ProfileEntry(DataModel):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The speed controller's own parameters, for an engineer who types gains into the drive. No run reads or writes them.
+# The speed controller's own parameters, for an engineer who types gains into the drive. No run writes them. A run reads
+# those that name an entry of `parameters`.
+
+
+ReadFrom = Annotated[str | None, Field(
+    default=None, pattern=r"^[a-z][a-z0-9_]*$",
+    description="entry of `parameters` that reads it in preflight, with a per_lsb in this unit; null = not read",
+)]
 
 
 class ControllerGain(ProfileEntry):
@@ -58,6 +65,7 @@ class ControllerGain(ProfileEntry):
         description="nm_s_rad: N·m per rad/s; percent_per_percent: torque in % of rated for a speed error in % of the "
         "rated (or reference) speed; unknown: the manual gives none"
     )
+    parameter: ReadFrom = None
 
 
 class ControllerIntegral(ProfileEntry):
@@ -67,6 +75,25 @@ class ControllerIntegral(ProfileEntry):
     unit: Literal["s", "ms", "nm_rad", "unknown"] = Field(
         description="s, ms: an integral time T_I, so that I = P/T_I; nm_rad: the integral gain itself"
     )
+    parameter: ReadFrom = None
+
+
+class ControllerFilter(ProfileEntry):
+    """Filter of the speed that the speed controller sees."""
+
+    title: str = Field(min_length=3, description="the manual's number and name")
+    unit: Literal["s", "ms", "hz", "unknown"] = Field(description="s, ms: a time constant; hz: a cut-off frequency")
+    parameter: ReadFrom = None
+
+
+class NotchParameter(ProfileEntry):
+    """One parameter of the drive's notch filter (s² + 2 ζ_z ω s + ω²)/(s² + 2 ζ_p ω s + ω²)."""
+
+    title: str = Field(min_length=3, description="the manual's number and name")
+    quantity: Literal["frequency_hz", "width_hz", "depth_db", "numerator_damping", "denominator_damping"] = Field(
+        description="width_hz: between the frequencies of −3 dB; depth_db: attenuation at the frequency, above 0; "
+        "numerator_damping, denominator_damping: ζ_z and ζ_p"
+    )
 
 
 class SpeedControllerParameters(DataModel):
@@ -74,7 +101,31 @@ class SpeedControllerParameters(DataModel):
 
     gain: ControllerGain
     integral: ControllerIntegral
+    filter: ControllerFilter | None = Field(
+        default=None, description="filter of the speed that it sees; null = not known"
+    )
+    notch: tuple[NotchParameter, ...] = Field(
+        default=(), description="parameters of its notch filter; [] = the drive has none, or it is not known"
+    )
+    simulated_only: bool = Field(
+        default=False, description="true: only the simulated drive has them; nothing is read from a real one"
+    )
     note: str | None = Field(default=None, description="further facts: adaptation, a filter, where it acts")
+
+    @model_validator(mode="after")
+    def _one_notch(self) -> Self:
+        found = [one.quantity for one in self.notch]
+        findings: list[Finding] = [("notch", f"{name} stands there twice") for name in sorted(set(found))
+                                   if found.count(name) > 1]
+        if found and "frequency_hz" not in found:
+            findings.append(("notch", "a notch needs its frequency_hz"))
+        refuse_if(findings)
+        return self
+
+    def read_from(self) -> dict[str, str]:
+        """Return the names of the `parameters` that are read: of ``gain``, ``integral`` and ``filter``."""
+        parts = (("gain", self.gain), ("integral", self.integral), ("filter", self.filter))
+        return {name: part.parameter for name, part in parts if part is not None and part.parameter is not None}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -100,6 +151,11 @@ class DriveProfile(DataModel):
     speed_controller: SpeedControllerParameters | None = Field(
         default=None, description="parameters of its speed controller, for `tdhil tune`; no run changes them"
     )
+
+    def _speed_controller_names(self) -> list[tuple[str, str | None]]:
+        """Return (place, name) of each entry of `parameters` that the speed controller refers to."""
+        parts = {} if self.speed_controller is None else self.speed_controller.read_from()
+        return [(f"speed_controller.{part}.parameter", name) for part, name in parts.items()]
 
     def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """Return (name, entry) for all entries of the profile that have a source and a confidence."""

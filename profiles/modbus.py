@@ -388,6 +388,7 @@ class ModbusProfile(DriveProfile):
         for at in ("speed_setpoint", "torque_setpoint", "speed", "torque", "torque_demand"):
             signal = getattr(self.cycle, at)
             wanted.append((f"cycle.{at}.times", signal.times if signal else None))
+        wanted += self._speed_controller_names()
         wanted += [(f"filters.{number}.parameter", one.parameter) for number, one in enumerate(self.filters)]
         wanted += [(f"parameters.{number}.times", one.times) for number, one in enumerate(self.parameters)]
         wanted += [(f"echoes.{number}.times", one.times) for number, one in enumerate(self.echoes)]

@@ -8,6 +8,7 @@
 6064 · 608F                angle · its counts a turn                   increments
 6076 · 6075                rated torque · rated current                mN·m · mA
 6087                       torque slope                                ‰ of 6076h per second
+5FFD                       gains and filter of the speed loop          N·m·s/rad, N·m/rad, s
 606E 6070                  times                                       ms
 ==========  =======================================================  ======================
 """
@@ -17,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import floor, pi
 
+from canopen.objectdictionary import datatypes
 from canopen.sdo import SdoAbortedError
 
 from profiles import MessageCode, TdhilError
@@ -102,6 +104,10 @@ def profile_units(drive: DriveParams, profile: Cia402Profile, scales: dict[str, 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
+SPEED_LOOP_INDEX = 0x5FFD
+"""Record with the gains of the speed loop (REAL32, ro), which only the simulated drive has: P, I, speed filter."""
+
+
 def rated_torque_counts(rated_torque_nm: float, per_count_nm: float) -> int:
     """Return the value of 6076h (UNSIGNED32) for a rated torque. Raises TdhilError if the object cannot hold it."""
     counts, most = round(rated_torque_nm / per_count_nm), (1 << 32) - 1
@@ -155,6 +161,7 @@ class ApplicationObjects:
         self._bind_process_data()
         self._bind_settings()
         self._bind_limits()
+        self._add_speed_loop()
 
     def _ratings(self) -> None:
         """Set the defaults that depend on the rig. The drive's own limits are also the highest values that may be
@@ -232,6 +239,14 @@ class ApplicationObjects:
         for index in present:
             store.hooks[key_of(index)] = torque(index)
         store.hooks[key_of(0x6080)] = speed
+
+    def _add_speed_loop(self) -> None:
+        """Add the gains of the speed loop, for a host that reads them."""
+        drive = self._application.inverter.params.drive
+        gains = (drive.speed_gain_nm_s_rad, drive.speed_integral_gain_nm_rad, drive.speed_filter_s)
+        for sub, value in enumerate(gains, 1):
+            self._store.add(SPEED_LOOP_INDEX, sub, datatypes.REAL32, writable=False, mappable=False,
+                            name=f"Speed loop {sub}", default=value)
 
     def _setting(self, index: int, name: str, allowed: set[int]) -> None:
         settings: ApplicationSettings = self._application.settings

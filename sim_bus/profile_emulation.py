@@ -9,10 +9,19 @@ from math import isfinite, nan
 from canopen.objectdictionary import datatypes
 
 from profiles.cia402 import Cia402Profile, Parameter
-from sim_bus.application_objects import TURN, ObjectUnits, clamped, counts_per_turn, profile_units, wrapped
+from sim_bus.application_objects import (
+    SPEED_LOOP_INDEX,
+    TURN,
+    ObjectUnits,
+    clamped,
+    counts_per_turn,
+    profile_units,
+    wrapped,
+)
 from sim_bus.cia402 import Application, OperationMode
 from sim_bus.objects import ObjectStore, key_of
 from sim_bus.reports import Feedback
+from sim_bus.speed_controller import speed_loop_settings
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Manufacturer's settings of an emulated profile: their objects, initial values, and the effect of those that limit.
@@ -38,6 +47,8 @@ class WornSettings:
         self._profile = profile
         self._application = application
         self.raw: dict[str, float] = {}
+        drive = application.inverter.params.drive
+        self._speed_loop = speed_loop_settings(profile.speed_controller, drive, drive.speed_limit_rpm)
         for one in profile.parameters:
             if one.set_to is None:
                 self.raw[one.name] = self._delivered(one)
@@ -66,7 +77,8 @@ class WornSettings:
         """Add the objects to the store."""
         for one in self._profile.parameters:
             key = key_of(one.index, one.sub)
-            store.add(one.index, one.sub, DATA_TYPES[one.type], writable=True, mappable=False, name=one.name)
+            store.add(one.index, one.sub, DATA_TYPES[one.type], writable=one.name not in self._speed_loop,
+                      mappable=False, name=one.name)
             start = self.raw[one.name]
             store.set_default(one.index, one.sub, start if one.type == "f32" else int(start))
             if one.type == "f32":
@@ -107,6 +119,8 @@ class WornSettings:
         """Return the object's initial value: as required, else the factory's, else one that suits the simulated
         machine.
         """
+        if one.name in self._speed_loop:
+            return self._speed_loop[one.name] / self._unit(one)
         wanted = one.require
         if wanted is not None:
             value = wanted.equals if wanted.equals is not None else wanted.one_of[0] if wanted.one_of else one.default
@@ -183,6 +197,7 @@ class WornProfile:
         profile = self.profile
         torque, speed, stop = profile.torque, profile.speed, profile.quick_stop
         present: dict[int, bool] = {
+            SPEED_LOOP_INDEX: False,       # comes back with the settings of a profile that names it
             0x6007: profile.watchdog.reaction_index == 0x6007,
             0x605A: stop.option_code is not None,
             0x6064: profile.position is not None,

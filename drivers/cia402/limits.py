@@ -32,14 +32,23 @@ class DriveSettings:
 
     def value(self, wanted: str) -> float:
         """Return the setting in its unit. Raises ObjectRefused."""
+        return self.read(wanted)[1]
+
+    def where(self, wanted: str) -> str:
+        """Return the name of its object."""
+        one = self._profile.parameter(wanted)
+        return name(one.index, one.sub)
+
+    def read(self, wanted: str) -> tuple[float, float]:
+        """Return the setting in counts, and in its unit. Raises ObjectRefused."""
         one = self._profile.parameter(wanted)
         where = name(one.index, one.sub)
         raw = decode_value(one.type, self._objects.rely_on(one.title, one.index, one.sub), where)
         if one.scale == "power_of_two":
             if not 0 <= raw <= 64:
                 raise ObjectRefused(f"{raw:g} is not a number of bits from 0 to 64", where=where)
-            return float(2.0**raw)
-        return raw * self.per_lsb(one)
+            return raw, float(2.0**raw)
+        return raw, raw * self.per_lsb(one)
 
     def per_lsb(self, one: Parameter) -> float:
         """Return the units for one count. Raises ObjectRefused, also for a scale of zero."""

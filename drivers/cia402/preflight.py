@@ -29,6 +29,7 @@ from drivers.drive import DriveLimits, Identity, Mode, Preflight, ReportingFilte
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
+from drivers.speed_loop import ReadSetting, read_speed_loop
 from drivers.standstill import standstill_limit_rad_s
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode
@@ -367,6 +368,11 @@ def report(
 ) -> Preflight:
     """Return the table with the properties of the drive."""
     filters = read_filters(table.note, objects, profile)
+    settings = DriveSettings(objects, profile)
+    speed_loop = read_speed_loop(
+        table, profile.speed_controller, lambda wanted: ReadSetting(*settings.read(wanted)), settings.where,
+        simulated=identity.simulated,
+    )
     return Preflight(
         identity=identity,
         checks=tuple(table.checks),
@@ -379,6 +385,7 @@ def report(
         watchdog_s=watchdog_s,
         safe_action=profile.watchdog.reaction if watchdog_s else "none",
         filters=filters,
+        speed_loop=speed_loop,
         torque_setpoint="6071h",
         torque_offset_resolution_nm=units.offset_nm_per_lsb,
         kept_torque_nm=kept.get(TORQUE),

@@ -49,7 +49,7 @@ from drivers.modbus.cycle import (
 from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped, tell_stage
 from drivers.modbus.link import Link, late_replies
 from drivers.modbus.other_master import OtherMaster
-from drivers.modbus.parameters import find_filters, own_speed_limits, set_limits
+from drivers.modbus.parameters import find_filters, find_speed_loop, own_speed_limits, set_limits
 from drivers.modbus.pdu import BUSY, CycleRefused, LinkLost, RegisterRefused
 from drivers.modbus.position import AngleRegister, find_angle
 from drivers.modbus.preflight import check_setpoints, clear_setpoints
@@ -199,6 +199,7 @@ class ModbusDrive:
         watched, shared = True, False
         own = OwnLimits(limits.accept_wider)
         filters = find_filters(table, profile, found)
+        speed_loop = find_speed_loop(table, profile, found, simulated=self._identity.simulated)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             set_limits(table, access, profile, limits, rated_nm, found, own)
             self._angle = find_angle(table, access, profile)
@@ -250,6 +251,7 @@ class ModbusDrive:
             watchdog_s=limits.watchdog_s if watched else 0.0,
             safe_action=profile.watchdog.reaction if watched else "none",
             filters=filters,
+            speed_loop=speed_loop,
             torque_setpoint=register_name(target.register_) if target is not None else "none",
             quick_stop_holds=profile.quick_stop.ends == "quick_stop",
             kept_torque_nm=own.kept.get(TORQUE),

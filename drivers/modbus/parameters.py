@@ -10,12 +10,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from drivers.drive import DriveLimits, ReportingFilters
+from drivers.drive import DriveLimits, ReportingFilters, SpeedLoopPresent
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import RANGES, RPM, per_count, register_name, settle, to_counts
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable, agreed_rated_torque, spare
+from drivers.speed_loop import ReadSetting, read_speed_loop
 from profiles import Require
 from profiles.modbus import ModbusProfile, Parameter, Register
 
@@ -178,6 +179,20 @@ def find_filters(table: PreflightTable, profile: ModbusProfile, found: Parameter
         lags[entry.signal] = lag_s
         sources.append(f"{entry.signal}: {where}" + (f"; {entry.advice}" if entry.advice else ""))
     return ReportingFilters(lags.get("speed"), lags.get("torque"), ", ".join(sources))
+
+
+def find_speed_loop(
+    table: PreflightTable, profile: ModbusProfile, found: Parameters, *, simulated: bool
+) -> SpeedLoopPresent | None:
+    """Return the gains of the drive's speed loop from the parameters that were read."""
+
+    def read(name: str) -> ReadSetting:
+        if name not in found.counts or name not in found.values:
+            raise PreflightRefused("not reported", where=name)
+        return ReadSetting(float(found.counts[name]), found.values[name])
+
+    return read_speed_loop(table, profile.speed_controller, read, lambda name: where_of(profile.parameter(name)),
+                           simulated=simulated)
 
 
 def where_of(parameter: Parameter) -> str:

@@ -11,6 +11,7 @@ from sim_bus.inverter import RPM
 from sim_bus.modbus.codec import RegisterLayout
 from sim_bus.modbus.wrong_maps import Wrong, something_else
 from sim_bus.params import RigParams
+from sim_bus.speed_controller import speed_loop_settings
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Required value of a parameter: check, and a value that meets it.
@@ -59,11 +60,14 @@ def start(store: ParameterStore, profile: ModbusProfile, rig: RigParams) -> floa
     plate = profile.name_plate
     torque_names = {name for name in (profile.rated_torque, plate and plate.torque) if name}
     rated_rpm = _fitting_rated_rpm(profile, rig)
+    gains = speed_loop_settings(profile.speed_controller, rig.drive, rated_rpm)
     # Parameters that multiply others come first.
     for parameter in sorted(profile.parameters, key=lambda one: (one.times is not None, one.name not in torque_names)):
         name = parameter.name
         if name in torque_names:
             _put_exactly(store, profile, name, rig.drive.rated_torque_nm)
+        elif name in gains:
+            store.put(name, gains[name])
         elif plate is not None and name == plate.speed:
             _put_exactly(store, profile, name, rated_rpm)
         elif plate is None or name != plate.power:

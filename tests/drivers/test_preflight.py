@@ -16,6 +16,7 @@ ROWS = [
     "identity", "state", "modes of operation", "rated torque", "angle of the motor", "torque limit", "speed limit",
     "quick-stop ramp", "quick-stop option", "temperature", "targets", "mode display for 9", "mode display for 10",
     "PDO mapping", "cycle", "stepped time", "drive's heartbeat", "watchdog reaction", "watchdog",
+    "speed loop: gain", "speed loop: integral", "speed loop: filter",
 ]
 
 
@@ -46,7 +47,7 @@ def test_a_drive_as_it_should_be(make, peer):
     assert found.refused == ()
     assert (found.identity.vendor, found.identity.serial, found.identity.name) == (0x11, 0x44, "scripted")
     notes = {check.name for check in found.checks if check.outcome is Outcome.NOTE}
-    assert notes == {"identity", "angle of the motor", "temperature"}
+    assert notes == {"identity", "angle of the motor", "temperature", *ROWS[-3:]}
     assert peer.operational
 
 
@@ -453,7 +454,7 @@ def test_everything_wrong_at_once(make, peer, profile):
     rows = [check.name for check in found.checks]
     by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4"}
     assert rows == [name for row in ROWS if (name := by_row.get(row, row))]
-    good = {"stepped time", "angle of the motor", "temperature", "torque limit"}     # tighter, so it stays
+    good = {"stepped time", "angle of the motor", "temperature", "torque limit", *ROWS[-3:]}     # tighter, so it stays
     assert set(refused(found)) == set(rows) - good
     assert all(check.where for check in found.refused)
 

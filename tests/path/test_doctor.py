@@ -195,7 +195,7 @@ def test_a_link_that_is_not_there():
 def test_every_register_beside_its_meaning():
     done = tdhil("doctor", "--drive", "modbus", "--simulate")
     assert done.code == 0, done.out
-    for said in ("all 23 of profile generic/modbus can be read", "SIMULATED", "rated torque: 1000 N·m",
+    for said in ("all 26 of profile generic/modbus can be read", "SIMULATED", "rated torque: 1000 N·m",
                  "42 (002Ah)", "305419896", "name plate", "0.4 s"):
         assert said in done.out
     document = tdhil("doctor", "--drive", "modbus", "--simulate", "--json").document

@@ -45,7 +45,8 @@ def test_what_is_not_said_is_as_in_cia402() -> None:
     profile = load_canopen_profile("generic/cia402")
     assert (profile.torque.rated.index, profile.torque.rated.type, profile.torque.actual) == (0x6076, "u32", None)
     assert profile.modes.mapped and profile.cyclic.has_period
-    assert profile.parameters == profile.speed.times == profile.speed.over == ()
+    assert profile.speed.times == profile.speed.over == ()
+    assert [one.name for one in profile.parameters] == list(profile.speed_controller.read_from().values())
     assert profile.quick_stop.ends == "quick_stop"
     assert profile.speed.si_unit is None
 
