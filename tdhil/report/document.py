@@ -84,6 +84,25 @@ def marks(document: Mapping[str, Any]) -> str:
     return " · ".join(found)
 
 
+def speed_loop_present_of(run: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the gains of the drive's own speed loop as read before motion; None if the drive reported none.
+
+    P, I and the filter are in SI at the motor shaft, None if unknown. ``settings`` has what was read. A log is not
+    trusted.
+    """
+    found = _mapping(run.get("speed_loop_present"))
+    if found is None:
+        return None
+    settings = {}
+    for part in ("gain", "integral", "filter"):
+        read = _mapping(found.get(part))
+        if read is not None:
+            texts = {name: text_of(read.get(name)) or "" for name in ("title", "where", "unit", "confidence")}
+            settings[part] = texts | {name: _positive(read.get(name)) for name in ("raw", "value")}
+    numbers = {name: _positive(found.get(name)) for name in ("gain_nm_s_rad", "integral_nm_rad", "filter_s")}
+    return numbers | {"settings": settings} if settings else None
+
+
 def run_facts(recording: Recording, run: Mapping[str, Any], log: str) -> dict[str, Any]:
     """Return what the document of a run with a virtual string or with steps states of the run itself."""
     return {
@@ -141,6 +160,7 @@ def result_document(
         "impedance": None if found.impedance is None else asdict(found.impedance) | {
             "verdict": found.impedance.verdict.value
         },
+        "speed_loop_present": speed_loop_present_of(run),
         "torque_ratios": [asdict(ratio) for ratio in found.torque_ratios],
         "lines": [asdict(line) for line in found.lines],
         "frequency_response": _response(found.frequency_response),
@@ -257,6 +277,13 @@ def _mapping(value: object) -> dict[str, Any] | None:
 
 def _count(value: object) -> int:
     return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else 0
+
+
+def _positive(value: object) -> float | None:
+    """Return a finite number of at least 0; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) and value >= 0.0 else None
 
 
 def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:

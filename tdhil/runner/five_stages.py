@@ -236,6 +236,8 @@ class Runner:
             self._log.learn(
                 impedance=ImpedanceInput(by, count, task.request.reference_filter_s, task.string_at_motor_nm_s_rad)
             )
+        if preflight.speed_loop is not None:
+            self._log.configure(speed_loop_present=asdict(preflight.speed_loop))
         self._log.learn(
             speed_resolution_rad_s=preflight.speed_resolution_rad_s,
             torque_resolution_nm=preflight.torque_resolution_nm,

@@ -48,3 +48,33 @@ def test_a_refusal_has_the_same_keys_with_nothing_in_them():
     assert empty.keys() == result_document(full(), recording(), {}, "run.mcap").keys()
     assert empty["budget"] == empty["second_opinions"] == empty["friction_curve"] == empty["lines"] == []
     assert empty["compliant"] is None
+
+
+SETTING = {"title": "25.02 gain", "where": "register 1", "raw": 12.0, "value": 1.2, "unit": "nm_s_rad",
+           "confidence": "likely"}
+
+
+def test_gains_that_the_drive_reported_are_in_it():
+    run = {"speed_loop_present": {"gain": SETTING, "integral": None, "filter": None, "gain_nm_s_rad": 1.2,
+                                  "integral_nm_rad": None, "filter_s": None}}
+    document = result_document(full(), recording(), run, "run.mcap")
+    assert document["speed_loop_present"] == {
+        "gain_nm_s_rad": 1.2, "integral_nm_rad": None, "filter_s": None, "settings": {"gain": SETTING}}
+
+
+@pytest.mark.parametrize("stated", [
+    None, 3, "none", [], {}, {"gain": 5, "gain_nm_s_rad": 1.0}, {"gain": None, "integral": None, "filter": None},
+])
+def test_a_log_without_them_says_null(stated):
+    document = result_document(full(), recording(), {"speed_loop_present": stated}, "run.mcap")
+    assert document["speed_loop_present"] is None
+
+
+def test_a_log_is_not_trusted_about_them():
+    run = {"speed_loop_present": {
+        "gain": {"title": "a\nb\x1b", "where": 7, "raw": "12", "value": float("nan"), "unit": True},
+        "gain_nm_s_rad": -3.0, "integral_nm_rad": "4", "filter_s": True}}
+    found = result_document(full(), recording(), run, "run.mcap")["speed_loop_present"]
+    assert [found[name] for name in ("gain_nm_s_rad", "integral_nm_rad", "filter_s")] == [None] * 3
+    assert found["settings"]["gain"] == {
+        "title": "a b", "where": "", "unit": "", "confidence": "", "raw": None, "value": None}
