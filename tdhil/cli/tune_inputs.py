@@ -13,7 +13,7 @@ from profiles import load_profile
 from tdhil.errors import MessageCode, TdhilError, UsageError
 
 if TYPE_CHECKING:
-    from profiles import Profile
+    from profiles import Profile, SpeedControllerParameters
     from tdhil.soft_torque import Interval
 
 
@@ -191,6 +191,12 @@ def profile_for(namespace: argparse.Namespace, result: Mapping[str, Any]) -> Pro
     """Return the profile of --profile, or else the result's; None if neither names one."""
     name = namespace.profile or (result.get("profile") or {}).get("name")
     return load_profile(str(name)) if name is not None else None
+
+
+def speed_controller_of(profile: Profile | None, result: Mapping[str, Any]) -> SpeedControllerParameters | None:
+    """Return the parameters of the drive's speed controller; None if the profile has none for this drive."""
+    found = None if profile is None else profile.speed_controller
+    return None if found is None or (found.simulated_only and not result.get("simulated")) else found
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ from tdhil.cli.tune_inputs import (
     read_impedance,
     read_result,
     require_result,
+    speed_controller_of,
 )
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import Console
 
-    from profiles import Profile
+    from profiles import Profile, SpeedControllerParameters
     from tdhil.report import TunedFor
     from tdhil.soft_torque import (
         DrillString,
@@ -144,7 +145,8 @@ def run(namespace: argparse.Namespace) -> int:
         tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
         document = tuning_document(tuning, tuned_for)
         if namespace.depths is not None:
-            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, profile, progress)
+            parameters = speed_controller_of(profile, result) if namespace.loop == "drive" else None
+            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, parameters, progress)
         if report is not None or namespace.map:
             progress("the operator's map: set speed and bit torque")
             found = operator_map(tuning)
@@ -239,7 +241,7 @@ def depths(text: str) -> tuple[float, ...]:
 
 
 def _schedule(
-    case: TuneCase, namespace: argparse.Namespace, ratio: float, profile: Profile | None,
+    case: TuneCase, namespace: argparse.Namespace, ratio: float, parameters: SpeedControllerParameters | None,
     progress: Callable[[str], None],
 ) -> dict[str, Any]:
     """Return gains over depth: soft ones, which any drive accepts, or compensated ones with --compensate."""
@@ -253,7 +255,6 @@ def _schedule(
                          entry=MessageCode.VALUE_NOT_ALLOWED) from None
     found = schedule(case, namespace.depths, "compensated" if namespace.compensate else "soft",
                      simulated=not namespace.no_simulation, report=progress)
-    parameters = profile.speed_controller if profile is not None and namespace.loop == "drive" else None
 
     def settings(law: SpeedController) -> Sequence[DriveSetting]:
         if parameters is None:
@@ -558,7 +559,7 @@ def _tuned_for(
     warnings = inertia_warnings(result)
     ratio = float(result["gear_ratio"])
     if profile is not None and namespace.loop == "drive":
-        parameters = profile.speed_controller
+        parameters = speed_controller_of(profile, result)
         for one in tuning.tuned:
             if one.controller is not None and parameters is not None:
                 at_motor = one.controller.at_shaft(ratio)

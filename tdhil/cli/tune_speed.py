@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from tdhil.cli.tune_inputs import (
     read_impedance,
     read_result,
     require_result,
+    speed_controller_of,
 )
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
@@ -33,7 +35,7 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.report import LoopTunedFor
-    from tdhil.speed_loop import LoopDesign, MeasuredShaft, PiGains, Range, SpeedLoopCase, UncertainPlant
+    from tdhil.speed_loop import LoopDesign, MeasuredShaft, PiGains, Range, UncertainPlant
 
     Lags = tuple[tuple[Range, ...], Range, str]
 
@@ -65,7 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dead-time", type=amount(TIME), metavar="S",
                         help="dead time of sampling and computing (default 0.003, assumed)")
     parser.add_argument("--present", type=float, nargs=2, metavar=("P", "I"),
-                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft, for comparison")
+                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft, for comparison "
+                        "(default: as measured by --impedance, or as the drive reported them before the run)")
     parser.add_argument("--no-notch", action="store_true", help="use no notch filter; not every drive has one")
     parser.add_argument("--profile", metavar="NAME",
                         help="profile of the drive, for its parameters (default: the result's)")
@@ -92,7 +95,7 @@ def run(namespace: argparse.Namespace) -> int:
         save_loop_picture,
         stderr_console,
     )
-    from tdhil.speed_loop import design_speed_loop
+    from tdhil.speed_loop import SpeedLoopCase, design_speed_loop
 
     _check(namespace)
     report = ReportFile.of_files(namespace, namespace.result)
@@ -102,9 +105,13 @@ def run(namespace: argparse.Namespace) -> int:
     measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
     lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)
     plant = plant_of(result, lags, dead_time, namespace.result)
-    design = design_speed_loop(_case(namespace, plant, measured))
-    profile = profile_for(namespace, result)
-    document = loop_document(design, shaft_in(result), _tuned_for(result, namespace, design, lags_from, profile))
+    present, present_from = present_gains(namespace, measured, result)
+    case = SpeedLoopCase(plant, namespace.phase_margin, namespace.gain_margin, namespace.bandwidth, present,
+                         not namespace.no_notch)
+    design = design_speed_loop(case)
+    tuned_for = _tuned_for(result, namespace, design, profile_for(namespace, result))
+    tuned_for = replace(tuned_for, lags_from=lags_from, present_from=present_from)
+    document = loop_document(design, shaft_in(result), tuned_for)
     if namespace.json:
         print_json(document)
     else:
@@ -216,19 +223,62 @@ def _range(ends: tuple[float, float, float]) -> Range:
     return Range(value, low, high)
 
 
-def _case(
-    namespace: argparse.Namespace, plant: UncertainPlant, measured: Mapping[str, Any] | None
-) -> SpeedLoopCase:
-    from tdhil.speed_loop import PiGains, SpeedLoopCase
+def present_gains(
+    namespace: argparse.Namespace, measured: Mapping[str, Any] | None, result: Mapping[str, Any]
+) -> tuple[PiGains | None, str | None]:
+    """Return the gains in the drive and their source: typed, measured, or as the drive reported them before the run.
 
-    present: PiGains | None = None
+    None without gains; the source then states why, or is None if there is none.
+    """
+    from tdhil.speed_loop import PiGains
+
     if namespace.present is not None:
-        present = PiGains(*namespace.present)
-    elif measured is not None:
+        return PiGains(*namespace.present), "as stated (--present)"
+    if measured is not None:
         gain, integral = (ends_of(measured[key])[1] for key in ("gain_nm_s_rad", "integral_nm_rad"))
-        present = PiGains(gain, integral) if gain > 0.0 and integral > 0.0 else None
-    return SpeedLoopCase(plant, namespace.phase_margin, namespace.gain_margin, namespace.bandwidth, present,
-                         not namespace.no_notch)
+        return _comparable(gain, integral, "as measured (--impedance)")
+    return _reported_gains(result, namespace.rated_torque, namespace.rated_speed)
+
+
+def _reported_gains(
+    result: Mapping[str, Any], rated_torque_nm: float | None, rated_speed_rpm: float | None
+) -> tuple[PiGains | None, str | None]:
+    """Return the gains that the drive reported before the run, and their objects or registers."""
+    from tdhil.soft_torque import one_percent_nm_s_rad
+
+    found = result.get("speed_loop_present")
+    settings = found.get("settings") if isinstance(found, dict) else None
+    if not isinstance(found, dict) or not isinstance(settings, dict):
+        return None, None
+    read = [settings[part] for part in ("gain", "integral") if isinstance(settings.get(part), dict)]
+    source = f"reported by the drive ({', '.join(str(one.get('where')) for one in read)})"
+    unsure = sorted({str(one.get("confidence")) for one in read} - {"verified"}, reverse=True)
+    if unsure:
+        source += f", in units that the profile marks as {unsure[0]}"
+    if len(read) < 2 or not all(is_number(one.get("value")) for one in read):
+        return None, "not known: the drive did not report both gains"
+    gain, integral = (float(found[key]) if is_number(found.get(key)) else None
+                      for key in ("gain_nm_s_rad", "integral_nm_rad"))
+    units = [one.get("unit") for one in read]
+    if gain is None and units[0] == "percent_per_percent":
+        if rated_torque_nm is None or rated_speed_rpm is None:
+            return None, f"{source}; they need --rated-torque and --rated-speed of the motor's name plate"
+        gain = read[0]["value"] * one_percent_nm_s_rad(rated_torque_nm, rated_speed_rpm)
+        time_s = read[1]["value"] * {"s": 1.0, "ms": 1e-3}.get(str(units[1]), 0.0)
+        if integral is None and time_s > 0.0:
+            integral = gain / time_s
+    if "unknown" in units:
+        return None, f"{source}; the profile does not know their units"
+    return _comparable(float(gain or 0.0), float(integral or 0.0), source)
+
+
+def _comparable(gain_nm_s_rad: float, integral_nm_rad: float, source: str) -> tuple[PiGains | None, str]:
+    """Return the gains and their source; None, and why, without a positive P and I."""
+    from tdhil.speed_loop import PiGains
+
+    if gain_nm_s_rad <= 0.0 or integral_nm_rad <= 0.0:
+        return None, f"{source}; P or I is 0, and such a loop is not compared"
+    return PiGains(gain_nm_s_rad, integral_nm_rad), source
 
 
 def shaft_in(result: Mapping[str, Any]) -> MeasuredShaft | None:
@@ -252,21 +302,23 @@ def shaft_in(result: Mapping[str, Any]) -> MeasuredShaft | None:
 
 
 def _tuned_for(
-    result: Mapping[str, Any], namespace: argparse.Namespace, design: LoopDesign, lags_from: str,
-    profile: Profile | None,
+    result: Mapping[str, Any], namespace: argparse.Namespace, design: LoopDesign, profile: Profile | None
 ) -> LoopTunedFor:
     from tdhil.report import LoopTunedFor
-    from tdhil.soft_torque import SpeedController, drive_settings
+    from tdhil.soft_torque import SpeedController, drive_settings, notch_settings
 
     settings = {}
     warnings = inertia_warnings(result)
-    if profile is not None and profile.speed_controller is not None:
+    parameters = speed_controller_of(profile, result)
+    if profile is not None and parameters is not None:
         for row in design.rows:
             law = SpeedController(row.gains.gain_nm_s_rad, row.gains.integral_nm_rad)
-            settings[row.kind] = drive_settings(profile.speed_controller, law, namespace.rated_torque,
-                                                namespace.rated_speed)
-        if profile.speed_controller.note:
-            warnings.append(f"{profile.name}: {profile.speed_controller.note}")
+            settings[row.kind] = drive_settings(parameters, law, namespace.rated_torque, namespace.rated_speed)
+            if row.gains.notch is not None:
+                settings[row.kind] += notch_settings(parameters.notch, row.gains.notch.quantities())
+        if parameters.note:
+            warnings.append(f"{profile.name}: {parameters.note}")
     return LoopTunedFor(str(namespace.result), bool(result.get("simulated")), str(result.get("model")),
-                        None if profile is None else profile.name, float(result["gear_ratio"]), lags_from, settings,
-                        tuple(warnings), _range_or_none(result.get("speed_lag_s")))
+                        None if profile is None else profile.name, float(result["gear_ratio"]), settings=settings,
+                        notch_named=parameters is not None and bool(parameters.notch), warnings=tuple(warnings),
+                        reported_speed_lag_s=_range_or_none(result.get("speed_lag_s")))

@@ -31,6 +31,7 @@ from tdhil.speed_loop import (
     LoopDesign,
     LoopRow,
     MeasuredShaft,
+    NotchFilter,
     Range,
     deviation_from_model,
     loop_at_lines,
@@ -76,9 +77,13 @@ class LoopTunedFor:
     model: str
     profile: str | None
     gear_ratio: float
-    lags_from: str
+    lags_from: str = ""
+    present_from: str | None = None
+    """Source of the present gains, or why they are not known; None: no source."""
     settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
     """Settings in the drive's own parameters, by the row's kind."""
+    notch_named: bool = False
+    """True if the profile names the parameters of the drive's notch."""
     warnings: tuple[str, ...] = ()
     reported_speed_lag_s: Range | None = None
     """Lag of the reported speed, for tune verify; None: unknown."""
@@ -93,7 +98,7 @@ def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: Lo
         "kind": "speed_loop_tuning",
         "tuned_for": {
             "source": tuned_for.source, "simulated": tuned_for.simulated, "model": tuned_for.model,
-            "profile": tuned_for.profile, "gear_ratio": tuned_for.gear_ratio,
+            "profile": tuned_for.profile, "gear_ratio": tuned_for.gear_ratio, "present_from": tuned_for.present_from,
         },
         "plant": {name: None if part is None else [asdict(one) for one in part] if isinstance(part, tuple)
                   else asdict(part) for name, part in vars(plant).items()} | {
@@ -105,6 +110,7 @@ def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: Lo
         "controllers": [_controller(row, design, tuned_for.settings.get(row.kind, ())) for row in design.rows],
         "bandwidth_without_notch_hz": design.without_notch_hz,
         "sentence": _sentence(design),
+        "notch_by_hand": _notch_by_hand(design.tuned.gains.notch, tuned_for),
         "curves": {row.kind: _curves(loop_curve(design, row.gains, lowest_hz)) for row in design.rows},
         "measured": None if shaft is None else {
             "hertz": shaft.hertz.tolist(), "half_rel": shaft.half_rel.tolist(),
@@ -127,7 +133,8 @@ def _controller(row: LoopRow, design: LoopDesign, settings: tuple[DriveSetting, 
         "kind": row.kind,
         "gain_nm_s_rad": gains.gain_nm_s_rad, "integral_nm_rad": gains.integral_nm_rad,
         "integral_time_s": gains.gain_nm_s_rad / gains.integral_nm_rad,
-        "notch": None if gains.notch is None else asdict(gains.notch),
+        "notch": None if gains.notch is None else asdict(gains.notch) | {
+            "width_hz": gains.notch.width_hz, "depth_db": gains.notch.depth_db},
         "drive_parameters": [asdict(one) for one in settings],
         "as_believed": asdict(row.believed), "worst": asdict(row.worst),
         "failed": list(_failed(row, design)),
@@ -192,6 +199,18 @@ def _sentence(design: LoopDesign) -> str:
     return said
 
 
+def _notch_by_hand(notch: NotchFilter | None, tuned_for: LoopTunedFor) -> str | None:
+    """Return the notch in plain units if the profile does not name the drive's; None without a notch."""
+    if notch is None or tuned_for.notch_named:
+        return None
+    width = "" if notch.width_hz is None else f", width {notch.width_hz:.3g} Hz at −3 dB"
+    said = f"Notch: frequency {notch.hertz:.3g} Hz{width}, depth {notch.depth_db:.3g} dB."
+    if tuned_for.profile is None:
+        return f"{said} The drive's notch is not known without a profile. Look up its parameters in the manual."
+    return (f"{said} The profile {tuned_for.profile} does not know the drive's notch. Look up its parameters in the "
+            "manual, or add --no-notch if the drive has none.")
+
+
 def _curves(curve: LoopCurve) -> dict[str, Any]:
     names = ("value", "low", "high")
     return {"hertz": curve.hertz.tolist()} | {
@@ -245,6 +264,9 @@ def print_loop_tuning(document: Part, console: PlainConsole) -> None:
         for title, value, sure in settings:
             own.add_row(title, f"{value} ({sure})")
         console.print(own)
+    if document["notch_by_hand"] is not None:
+        console.print()
+        console.print(Words(document["notch_by_hand"]))
     if document["warnings"]:
         console.print()
     for warning, code in zip(document["warnings"], document["warning_codes"], strict=True):
@@ -264,6 +286,8 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     together = [1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high")]
     yield "lags in the loop", (f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together {together[0]:.3g} to "
                                f"{together[1]:.3g} ms; {plant['lags_from']}")
+    if document["tuned_for"]["present_from"] is not None:
+        yield "present gains", document["tuned_for"]["present_from"]
     required = document["required"]
     yield "margins asked for", f"{required['phase_deg']:g}° and {required['gain_db']:g} dB in the worst case"
     if document["measured"]:
@@ -288,6 +312,7 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     yield "T_I = P/I, s", [gain_words(one["integral_time_s"]) for one in every]
     if any(one["notch"] for one in every):
         yield "notch, Hz; dampings", [_notch(one["notch"]) for one in every]
+        yield "notch: width, Hz; depth, dB", [_notch_shape(one["notch"]) for one in every]
     limits = document["required"]
     for name, key, digits, unit in (("phase margin", "phase_deg", 0, "°"), ("gain margin", "gain_db", 1, " dB")):
         yield f"{name}, believed", [_margin(one["as_believed"], key, digits, unit) for one in every]
@@ -310,6 +335,11 @@ def _margin(part: Part, key: str, digits: int, unit: str) -> str:
 def _notch(part: Part | None) -> str:
     return "–" if part is None else (f"{part['hertz']:.3g}; {part['numerator_damping']:g} / "
                                      f"{part['denominator_damping']:g}")
+
+
+def _notch_shape(part: Part | None) -> str:
+    return "–" if part is None else "; ".join(
+        "–" if value is None else f"{value:.3g}" for value in (part["width_hz"], part["depth_db"]))
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -451,6 +481,8 @@ def loop_report(document: Part) -> Report:
             Text("Nothing here was written into any drive. Change one value at a time, at a low speed, with the "
                  "hard-wired stop in reach."),
         )))
+    if document["notch_by_hand"] is not None:
+        sections.append(ReportSection("Notch filter, to be set by hand", (Text(document["notch_by_hand"]),)))
     tuned_for = document["tuned_for"]
     sections.append(ReportSection("Basis of the result", (Pairs((
         *_rests_on(document), ("from", tuned_for["source"]), ("model", tuned_for["model"]),

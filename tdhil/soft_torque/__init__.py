@@ -27,7 +27,8 @@ if TYPE_CHECKING:
         evaluate as evaluate, program_for as program_for, refuse_untrue as refuse_untrue,
     )
     from tdhil.soft_torque.own_units import (
-        DriveSetting as DriveSetting, drive_settings as drive_settings,
+        DriveSetting as DriveSetting, drive_settings as drive_settings, notch_settings as notch_settings,
+        one_percent_nm_s_rad as one_percent_nm_s_rad,
     )
     from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
     from tdhil.soft_torque.stability import (
@@ -85,7 +86,7 @@ else:
                       "tuned_controller",
         "evaluation": "Evaluation EvaluationCase EvaluationRefused EvaluationOutcome Prediction Trial RigWindow "
                       "case_of evaluate program_for refuse_untrue",
-        "own_units": "DriveSetting drive_settings",
+        "own_units": "DriveSetting drive_settings notch_settings one_percent_nm_s_rad",
         "roots": "RootsLost count_in roots_in",
         "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
         "uncertainty": "Interval DrawnValues Truth draw_truths independent_axes joint_draws",

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi
+from math import log10, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,22 @@ class NotchFilter:
     """Numerator damping ζ_z."""
     denominator_damping: float
     """Denominator damping ζ_p. The gain at the centre frequency is ζ_z/ζ_p."""
+
+    @property
+    def depth_db(self) -> float:
+        """Attenuation at the centre frequency, dB."""
+        return 20.0 * log10(self.denominator_damping / self.numerator_damping)
+
+    @property
+    def width_hz(self) -> float | None:
+        """Distance 2 f √(ζ_p² − 2 ζ_z²) between the frequencies of −3 dB, Hz; None: it is nowhere that deep."""
+        square = self.denominator_damping**2 - 2.0 * self.numerator_damping**2
+        return 2.0 * self.hertz * sqrt(square) if square > 0.0 else None
+
+    def quantities(self) -> dict[str, float | None]:
+        """Return the notch by each quantity that a drive's parameter may have (`profiles.NotchParameter.quantity`)."""
+        return {"frequency_hz": self.hertz, "width_hz": self.width_hz, "depth_db": self.depth_db,
+                "numerator_damping": self.numerator_damping, "denominator_damping": self.denominator_damping}
 
     def at(self, s: Complexes) -> Complexes:
         """Return the transfer function N(s)."""

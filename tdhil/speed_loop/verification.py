@@ -121,7 +121,8 @@ def step_case_of(plain: Mapping[str, Any]) -> StepCase:
         ranged(said["dead_time_s"]), *(range_of(said.get(name)) for name in
                                        ("antiresonance_hz", "resonance_hz", "damping_nm_s_rad")))
     law = PiGains(float(gains["gain_nm_s_rad"]), float(gains["integral_nm_rad"]),
-                  None if notch is None else NotchFilter(**notch))
+                  None if notch is None else NotchFilter(*(float(notch[name]) for name in (
+                      "hertz", "numerator_damping", "denominator_damping"))))
     overshoot, rise, settling, lag = (
         ranged(plain[name]) for name in ("overshoot_share", "rise_s", "settling_s", "reported_lag_s"))
     return StepCase(str(plain["kind"]), plant, law, overshoot, rise, settling, lag, str(plain.get("source", "")))

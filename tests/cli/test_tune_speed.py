@@ -9,6 +9,7 @@ import re
 
 import pytest
 
+from profiles.library import profile_path
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode, MessageCode
 from tdhil.report import GRAPHS
@@ -89,6 +90,112 @@ def test_measured_lags_and_present_gains_come_from_the_impedance(tuned, tmp_path
     assert sum(lag["high"] for lag in lags) == pytest.approx(0.034)    # the sum is known to ±1 ms
     assert document["controllers"][0]["gain_nm_s_rad"] == pytest.approx(203.0)
     assert tuned("--impedance", path, "--present", 1, 1)[0] == ExitCode.USAGE
+
+
+def reported(gain=40.0, integral=30.0, units=("nm_s_rad", "nm_rad"), values=(40.0, 30.0), confidence="verified"):
+    rows = zip(("gain", "integral"), ("2101h", "2102h"), units, values, strict=True)
+    settings = {part: {"title": part, "where": where, "raw": 1.0, "value": value, "unit": unit,
+                       "confidence": confidence}
+                for part, where, unit, value in rows
+                if value is not None}
+    return {"gain_nm_s_rad": gain, "integral_nm_rad": integral, "filter_s": None, "settings": settings}
+
+
+def present_in(document):
+    found = [one for one in document["controllers"] if one["kind"] == "present"]
+    gains = (found[0]["gain_nm_s_rad"], found[0]["integral_nm_rad"]) if found else None
+    return gains, document["tuned_for"]["present_from"]
+
+
+def test_the_drives_own_gains_come_after_typed_and_measured_ones(tuned, tmp_path):
+    path = tmp_path / "z.json"
+    path.write_text(json.dumps(result(impedance=impedance())), encoding="utf-8")
+    _, document, _ = tuned(speed_loop_present=reported())
+    assert present_in(document) == ((40.0, 30.0), "reported by the drive (2101h, 2102h)")
+    _, document, _ = tuned("--present", 20, 10, speed_loop_present=reported())
+    assert present_in(document) == ((20.0, 10.0), "as stated (--present)")
+    _, document, _ = tuned("--impedance", path, speed_loop_present=reported())
+    gains, source = present_in(document)
+    assert (gains[0], source) == (pytest.approx(203.0), "as measured (--impedance)")
+    _, document, _ = tuned()
+    assert present_in(document) == (None, None)
+
+
+PERCENT = {"gain": None, "integral": None, "units": ("percent_per_percent", "ms"), "values": (10.0, 2000.0)}
+
+
+@pytest.mark.parametrize(("words", "said", "gains", "source"), [
+    ((), PERCENT, None, "they need --rated-torque and --rated-speed of the motor's name plate"),
+    # 10 %/% of 600 N·m and 1500 rpm = 157.08 rad/s: 38.197 N·m·s/rad; over 2 s.
+    (("--rated-torque", "600", "--rated-speed", "1500"), PERCENT, (38.197, 19.099), "(2101h, 2102h)"),
+    ((), {"gain": None, "integral": None, "units": ("unknown", "ms")}, None, "the profile does not know their units"),
+    ((), {"integral": 0.0, "values": (40.0, 0.0)}, None, "P or I is 0"),
+    ((), {"integral": None, "values": (40.0, None)}, None, "the drive did not report both gains"),
+    ((), {"confidence": "unverified"}, (40.0, 30.0), "in units that the profile marks as unverified"),
+])
+def test_gains_that_cannot_be_compared_say_why(tuned, words, said, gains, source):
+    code, document, _ = tuned(*words, speed_loop_present=reported(**said))
+    assert code == 0
+    found, text = present_in(document)
+    assert found == (gains if gains is None else pytest.approx(gains, rel=1e-4))
+    assert source in text
+
+
+@pytest.mark.parametrize("junk", [3, [], {}, {"settings": 4}, {"settings": {"gain": 1, "integral": 2}}])
+def test_a_broken_entry_is_no_error(tuned, junk):
+    code, document, _ = tuned(speed_loop_present=junk)
+    assert code == 0
+    assert present_in(document)[0] is None
+
+
+def test_the_terminal_names_the_source_of_the_present_gains(tuned):
+    code, text, _ = tuned(speed_loop_present=reported(), as_json=False)
+    assert code == 0
+    assert "present gains reported by the drive (2101h, 2102h)" in " ".join(text.split())
+
+
+def test_objects_of_the_simulated_drive_are_not_named_for_a_real_one(tuned):
+    for simulated in (True, False):
+        _, document, _ = tuned(profile={"name": "generic/cia402"}, simulated=simulated)
+        assert bool(document["controllers"][-1]["drive_parameters"]) is simulated
+
+
+NAMED = """  notch:
+    - {title: p1658 notch frequency, quantity: frequency_hz, source: the manual, confidence: likely}
+    - {title: p1659 notch width, quantity: width_hz, source: the manual, confidence: likely}
+    - {title: p1660 notch depth, quantity: depth_db, source: the manual, confidence: likely}
+    - {title: p1661 damping of the numerator, quantity: numerator_damping, source: the manual, confidence: likely}
+"""
+
+
+@pytest.mark.heavy
+def test_a_notch_is_given_in_the_drives_own_parameters(tuned, tmp_path):
+    text = profile_path("siemens/s120-canopen").read_text(encoding="utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace("speed_controller:\n", "speed_controller:\n" + NAMED), encoding="utf-8")
+    _, document, _ = tuned("--profile", path, compliant=COMPLIANT, frequency_response=None)
+    found = document["controllers"][-1]
+    notch = found["notch"]
+    assert [(one["title"], one["value"], one["unit"]) for one in found["drive_parameters"][2:]] == [
+        ("p1658 notch frequency", notch["hertz"], "Hz"), ("p1659 notch width", notch["width_hz"], "Hz"),
+        ("p1660 notch depth", notch["depth_db"], "dB"),
+        ("p1661 damping of the numerator", notch["numerator_damping"], "")]
+    assert document["notch_by_hand"] is None
+
+
+@pytest.mark.heavy
+def test_without_parameters_of_its_own_a_notch_is_given_in_plain_units(tuned):
+    _, document, _ = tuned("--profile", "abb/acs880-enhanced", compliant=COMPLIANT, frequency_response=None)
+    notch = document["controllers"][-1]["notch"]
+    said = document["notch_by_hand"]
+    assert said.startswith(f"Notch: frequency 3 Hz, width {notch['width_hz']:.3g} Hz at −3 dB, depth "
+                           f"{notch['depth_db']:.3g} dB.")
+    assert "The profile abb/acs880-enhanced does not know the drive's notch." in said
+    _, text, _ = tuned(compliant=COMPLIANT, frequency_response=None, as_json=False)
+    words = " ".join(text.split())
+    assert "Notch: frequency 3 Hz, width" in words and "The drive's notch is not known without a profile." in words
+    assert "notch: width, Hz; depth, dB" in words
+    assert max(map(len, text.splitlines())) <= 80
 
 
 @pytest.mark.heavy

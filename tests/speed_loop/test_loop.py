@@ -98,3 +98,17 @@ def test_gains_far_slower_than_the_lags_have_margins_too():
     found = speed_loop_margins([LoopPlant(1.0, 0.0, (0.01,))], PiGains(1e-4, 2.5e-9))[0]
     assert found.stable and 70.0 < found.phase_deg < 80.0
     assert 1e-5 < found.bandwidth_hz < 3e-5
+
+
+@pytest.mark.parametrize(("over", "under"), [(0.04, 0.4), (0.3, 1.0), (0.1, 1.0)])
+def test_width_and_depth_of_a_notch_are_those_of_its_response(over, under):
+    notch = NotchFilter(3.0, over, under)
+    assert -20.0 * math.log10(abs(notch.at(np.array([2j * math.pi * 3.0]))[0])) == pytest.approx(notch.depth_db)
+    assert notch.width_hz is not None
+    half = math.sqrt(9.0 + 0.25 * notch.width_hz**2)           # the ends lie evenly around it on a logarithmic scale
+    for hertz in (half - 0.5 * notch.width_hz, half + 0.5 * notch.width_hz):
+        assert abs(notch.at(np.array([2j * math.pi * hertz]))[0]) ** 2 == pytest.approx(0.5)
+
+
+def test_a_shallow_notch_has_no_width_of_3_db():
+    assert NotchFilter(3.0, 0.8, 1.0).width_hz is None
