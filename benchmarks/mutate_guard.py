@@ -166,6 +166,7 @@ SUBJECTS = {
         "test_cia402_without_bus.py", "test_torque_offset.py",
     ),
     "angle": _driver("angle", "test_angle_in_cycle.py"),
+    "speed loop": _driver("speed_loop", "test_speed_loop.py"),
     "standstill of a bare stop": _driver(
         "standstill", "test_standstill.py", "test_quick_stop.py", "test_modbus_quick_stop.py",
     ),
