@@ -24,11 +24,12 @@ _UNITS = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated to
 
 
 class DriveSettings:
-    """The drive's settings by name, in their units, read on request."""
+    """The drive's settings by name, in their units, read on request. ``relied_on``: they must not change in a run."""
 
-    def __init__(self, objects: Objects, profile: Cia402Profile) -> None:
+    def __init__(self, objects: Objects, profile: Cia402Profile, *, relied_on: bool = True) -> None:
         self._objects = objects
         self._profile = profile
+        self._relied_on = relied_on
 
     def value(self, wanted: str) -> float:
         """Return the setting in its unit. Raises ObjectRefused."""
@@ -43,7 +44,9 @@ class DriveSettings:
         """Return the setting in counts, and in its unit. Raises ObjectRefused."""
         one = self._profile.parameter(wanted)
         where = name(one.index, one.sub)
-        raw = decode_value(one.type, self._objects.rely_on(one.title, one.index, one.sub), where)
+        data = (self._objects.rely_on(one.title, one.index, one.sub) if self._relied_on
+                else self._objects.read_bytes(one.index, one.sub))
+        raw = decode_value(one.type, data, where)
         if one.scale == "power_of_two":
             if not 0 <= raw <= 64:
                 raise ObjectRefused(f"{raw:g} is not a number of bits from 0 to 64", where=where)

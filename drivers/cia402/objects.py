@@ -57,6 +57,10 @@ class Objects(ABC):
         self.relied_on[index, subindex] = title, data
         return data
 
+    def rely_on_value(self, title: str, index: int, subindex: int = 0) -> int:
+        """Return an unsigned number, as `rely_on`."""
+        return int.from_bytes(self.rely_on(title, index, subindex), "little")
+
     def write(self, index: int, subindex: int, value: int, bits: int) -> None:
         self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))
 

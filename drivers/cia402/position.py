@@ -80,7 +80,7 @@ def find_angle(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
 def _scale(objects: Objects, index: int, sub: int = 0) -> int | None:
     """Return a scale of the position; None if the drive does not have the object."""
     try:
-        return int.from_bytes(objects.rely_on(_SCALE, index, sub), "little")
+        return objects.rely_on_value(_SCALE, index, sub)
     except ObjectRefused:
         return None
 
@@ -94,9 +94,7 @@ def _standard_counts(objects: Objects) -> float:
     unit = _scale(objects, _UNIT)
     if unit is not None and unit not in _INCREMENTS:
         raise ObjectRefused(f"positions are counted in unit {unit:08X}h", where=name(_UNIT))
-    increments, turns = (
-        int.from_bytes(objects.rely_on(_SCALE, _ENCODER, sub), "little") for sub in (1, 2)
-    )
+    increments, turns = (objects.rely_on_value(_SCALE, _ENCODER, sub) for sub in (1, 2))
     counts = increments / turns if turns else 0.0
     if not (math.isfinite(counts) and counts >= FEWEST_COUNTS):
         raise ObjectRefused(f"{increments}/{turns} is not a number of increments per turn", where=name(_ENCODER))

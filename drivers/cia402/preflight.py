@@ -115,7 +115,7 @@ def speed_unit(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
         wanted = speed.si_unit
 
         def same() -> tuple[str, bool]:
-            found = int.from_bytes(objects.rely_on("the unit of speed", SI_UNIT_VELOCITY), "little")
+            found = objects.rely_on_value("the unit of speed", SI_UNIT_VELOCITY)
             return f"{found:08X}h", found == wanted
 
         table.attempt(
@@ -368,7 +368,7 @@ def report(
 ) -> Preflight:
     """Return the table with the properties of the drive."""
     filters = read_filters(table.note, objects, profile)
-    settings = DriveSettings(objects, profile)
+    settings = DriveSettings(objects, profile, relied_on=False)      # no run depends on the gains
     speed_loop = read_speed_loop(
         table, profile.speed_controller, lambda wanted: ReadSetting(*settings.read(wanted)), settings.where,
         simulated=identity.simulated,

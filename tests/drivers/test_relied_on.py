@@ -3,7 +3,7 @@
 import pytest
 
 from drivers.errors import CommunicationLost
-from tests.drivers.drive_benches import Run
+from tests.drivers.drive_benches import CanopenBench, Run
 from tests.drivers.ethercat_bench import EthercatBench
 from tests.drivers.profile_benches import Epos4Bench, S120Bench
 
@@ -83,3 +83,11 @@ def test_no_further_request_is_sent_for_them(make):
     assert 58 <= len(asked) <= 62
     assert {"a96000", "766000"} <= set(asked)
     assert 3 * sum(one in ("161001", "076000", "5a6000") for one in asked) >= len(asked) - 3
+
+
+@pytest.mark.heavy
+def test_a_gain_that_is_only_shown_may_change(make):
+    """Preflight reads the gains of the speed loop for `tdhil tune speed`. No run depends on them."""
+    run = make(CanopenBench)
+    change(run, 0x5FFD, 1)
+    run.go(TURN_S)
