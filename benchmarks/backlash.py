@@ -16,7 +16,6 @@ play, where its size is known, or of J cover, or if any backlash is found on a c
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from functools import lru_cache
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kept_rows import kept_rows
+from kept_rows import numbered_rows
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -126,17 +125,8 @@ def kept(rows: list[dict[str, Any]], clean: bool) -> bool:
 
 def main() -> int:
     """Run the study; 0 if the requirements are met."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rows", type=int, help="how many; 200, or 500 with --clean")
-    parser.add_argument("--first", type=int, default=0, help="the first one")
-    parser.add_argument("--step", type=int, default=1, help="every so many rows; 5 takes two of each batch")
-    parser.add_argument("--clean", action="store_true", help="without backlash")
-    parser.add_argument("--out", type=Path, help="file of the rows, continued if it exists")
-    asked = parser.parse_args()
-    count = asked.rows if asked.rows is not None else 500 if asked.clean else 200
-    rows = kept_rows(asked.out, "row", range(asked.first, asked.first + count, asked.step),
-                     lambda number: judged(number, asked.clean), show)
-    return 0 if kept(rows, asked.clean) else 1
+    rows, clean = numbered_rows(__doc__ or "", 200, 500, judged, show)
+    return 0 if kept(rows, clean) else 1
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ average, beyond what chance allows (99 %). Order 36 is shown and not judged (dec
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from dataclasses import replace
@@ -26,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kept_rows import kept_rows
+from kept_rows import numbered_rows
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -157,16 +156,7 @@ def kept(rows: list[dict[str, Any]]) -> bool:
 
 def main() -> int:
     """Run the study; 0 if no order is false, and orders 1 and 6 are found as required."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rows", type=int, help="how many; 180, or 500 with --clean")
-    parser.add_argument("--first", type=int, default=0, help="the first one")
-    parser.add_argument("--step", type=int, default=1, help="every so many rows; 5 takes two of each batch")
-    parser.add_argument("--clean", action="store_true", help="without harmonics")
-    parser.add_argument("--out", type=Path, help="file of the rows, continued if it exists")
-    asked = parser.parse_args()
-    count = asked.rows if asked.rows is not None else 500 if asked.clean else 180
-    numbers = range(asked.first, asked.first + count, asked.step)
-    rows = kept_rows(asked.out, "row", numbers, lambda number: judged(number, asked.clean), show)
+    rows, _ = numbered_rows(__doc__ or "", 180, 500, judged, show)
     table(rows)
     return 0 if kept(rows) else 1
 

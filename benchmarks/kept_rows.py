@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -33,6 +34,26 @@ def kept_rows(
                 kept.write(json.dumps(row) + "\n")
         show(row)
     return rows
+
+
+def numbered_rows(
+    doc: str, usual: int, usual_clean: int, judged: Callable[[int, bool], Row], show: Callable[[Row], None]
+) -> tuple[list[Row], bool]:
+    """Read the options of a study with numbered rows. Return its rows, and whether they are those without the effect.
+
+    ``doc``: docstring of the study. ``usual``, ``usual_clean``: number of rows, without and with ``--clean``.
+    ``judged`` makes the row of a number, with or without ``--clean``.
+    """
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    parser.add_argument("--rows", type=int, help=f"how many; {usual}, or {usual_clean} with --clean")
+    parser.add_argument("--first", type=int, default=0, help="the first one")
+    parser.add_argument("--step", type=int, default=1, help="every so many rows; 5 takes two of each batch")
+    parser.add_argument("--clean", action="store_true", help="rows without the effect")
+    parser.add_argument("--out", type=Path, help="file of the rows, continued if it exists")
+    asked = parser.parse_args()
+    count = asked.rows if asked.rows is not None else usual_clean if asked.clean else usual
+    numbers = range(asked.first, asked.first + count, asked.step)
+    return kept_rows(asked.out, "row", numbers, lambda number: judged(number, asked.clean), show), asked.clean
 
 
 def drop_rows(out: Path, dropped: Callable[[Row], bool]) -> None:

@@ -25,6 +25,9 @@ _UNITS: Mapping[str, str] = {
 }
 
 
+_SECONDS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3}
+
+
 class ReadSetting(NamedTuple):
     """Counts of a parameter, and its value in the unit of the profile's ``speed_controller``."""
 
@@ -41,7 +44,7 @@ def read_speed_loop(
     ``read`` reads a parameter of the profile by its name. It may raise PreflightRefused and ObjectRefused.
     """
     names = {} if parameters is None else parameters.read_from()
-    if parameters is None or not names or (parameters.simulated_only and not simulated):
+    if parameters is None or not names or not parameters.belongs_to(simulated=simulated):
         return None
     entries = {"gain": parameters.gain, "integral": parameters.integral, "filter": parameters.filter}
     found: dict[str, ReportedSetting] = {}
@@ -68,7 +71,7 @@ def in_si(
     proportional = gain.value if gain is not None and gain.unit == "nm_s_rad" else None
     integral_gain = None
     if integral is not None:
-        time_s = integral.value * {"s": 1.0, "ms": 1e-3}.get(integral.unit, math.nan)
+        time_s = integral.value * _SECONDS.get(integral.unit, math.nan)
         if integral.unit == "nm_rad":
             integral_gain = integral.value
         elif proportional is not None and time_s >= 0.0:
@@ -76,6 +79,6 @@ def in_si(
     filter_s = None
     if smoothing is not None and smoothing.unit == "hz":
         filter_s = 1.0 / (2.0 * math.pi * smoothing.value) if smoothing.value > 0.0 else 0.0
-    elif smoothing is not None and smoothing.unit in ("s", "ms"):
-        filter_s = smoothing.value * (1e-3 if smoothing.unit == "ms" else 1.0)
+    elif smoothing is not None and smoothing.unit in _SECONDS:
+        filter_s = smoothing.value * _SECONDS[smoothing.unit]
     return SpeedLoopPresent(gain, integral, smoothing, proportional, integral_gain, filter_s)

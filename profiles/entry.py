@@ -122,6 +122,10 @@ class SpeedControllerParameters(DataModel):
         refuse_if(findings)
         return self
 
+    def belongs_to(self, *, simulated: bool) -> bool:
+        """Return whether a simulated or a real drive has these parameters."""
+        return simulated or not self.simulated_only
+
     def read_from(self) -> dict[str, str]:
         """Return the names of the `parameters` that are read: of ``gain``, ``integral`` and ``filter``."""
         parts = (("gain", self.gain), ("integral", self.integral), ("filter", self.filter))

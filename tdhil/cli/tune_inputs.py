@@ -196,7 +196,7 @@ def profile_for(namespace: argparse.Namespace, result: Mapping[str, Any]) -> Pro
 def speed_controller_of(profile: Profile | None, result: Mapping[str, Any]) -> SpeedControllerParameters | None:
     """Return the parameters of the drive's speed controller; None if the profile has none for this drive."""
     found = None if profile is None else profile.speed_controller
-    return None if found is None or (found.simulated_only and not result.get("simulated")) else found
+    return found if found is not None and found.belongs_to(simulated=bool(result.get("simulated"))) else None
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ from tdhil.estimation.cubic_spline import CubicSpline
 from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.line_influence import inertia_changes, segment_means, widened
 from tdhil.estimation.result import AngleHarmonic, Estimate, normal_quantile
-from tdhil.estimation.samples import Samples, Stretch, usual_interval
+from tdhil.estimation.samples import Samples, Stretch, angle_readings, usual_interval
 from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Recording
 
@@ -115,13 +115,13 @@ class _Angle:
     @classmethod
     def of(cls, recording: Recording) -> _Angle | None:
         """Return the angle; None if the drive reports none, or hardly any."""
-        if recording.position_rad is None:
+        readings = angle_readings(recording)
+        if readings is None:
             return None
-        known = np.isfinite(recording.position_rad) & recording.fresh
-        times = np.asarray(recording.time_s[known], dtype=np.float64)
+        times, turned = readings
         if len(times) < _BAND_BINS or not np.all(np.diff(times) > 0.0):
             return None
-        spline = CubicSpline.through(times, np.asarray(recording.position_rad[known], dtype=np.float64))
+        spline = CubicSpline.through(times, turned)
         return cls(spline, float(times[0]), float(times[-1]), times)
 
     def at(self, time_s: FloatArray) -> FloatArray:
@@ -551,10 +551,10 @@ def _widened(
     """Return the finding with the part of the harmonics in the uncertainty of J."""
     if finding.inertia is None:
         return finding
-    rows = np.array([float(np.sum(inertia_changes(model.curve, model.theta, lines)))
-                     for lines in _lines_of_parts(case, segments, torque, model)])
-    if not len(rows):
+    lines = _lines_of_parts(case, segments, torque, model)
+    if not lines:
         return finding
+    rows = inertia_changes(model.curve, model.theta, lines).sum(axis=1)
     half = normal_quantile(case.options.confidence) * math.sqrt(max(float(rows @ torque.covariance @ rows), 0.0))
     return widened(finding, half, "harmonics of the angle", "their amplitudes and phases")
 

@@ -42,9 +42,9 @@ from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.line_influence import inertia_changes, segment_means, widened
 from tdhil.estimation.result import Backlash, Estimate, Refusal, normal_quantile
-from tdhil.estimation.samples import Samples, Stretch, thinned
+from tdhil.estimation.samples import Samples, Stretch, angle_readings, thinned
 from tdhil.estimation.spectrum import ComplexArray
-from tdhil.recording import FloatArray, IntArray, Recording
+from tdhil.recording import FloatArray, IntArray
 
 LEAST_GAIN = 60.0
 """Least decrease of −2 ln L by a backlash. `benchmarks/backlash.py` has the largest gain of 500 shafts without one."""
@@ -252,10 +252,11 @@ def with_backlash(case: PeriodicCase, finding: Finding) -> Finding:
 
     Without a reported angle, or with too few periods, the finding is returned unchanged.
     """
-    if case.recording.position_rad is None:
+    readings = angle_readings(case.recording)
+    if readings is None:
         return finding
     segments = {number: one for number, stretch in enumerate(case.stretches)
-                if (one := _angle_of(stretch, case.recording, finding)) is not None}
+                if (one := _angle_of(stretch, readings, finding)) is not None}
     if not segments:
         return finding
     fitted = _fitted(_Seen(tuple(segments.values())))
@@ -309,20 +310,20 @@ def _change(
         by_segment[number] = -(model.impedance(theta, s) * speed)[None]
     rows = segment_means(case, finding.curve, by_segment)
     # the parts of the lines do not cancel: the flanks of the model are not those of the coupling
-    return most * float(np.linalg.norm(inertia_changes(finding.curve, theta, rows[0]))) if rows else None
+    return most * float(np.linalg.norm(inertia_changes(finding.curve, theta, rows))) if rows else None
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The angle at the harmonics of the period
 
 
-def _angle_of(stretch: Stretch, recording: Recording, finding: Finding) -> _SegmentAngle | None:
+def _angle_of(
+    stretch: Stretch, readings: tuple[FloatArray, FloatArray], finding: Finding
+) -> _SegmentAngle | None:
     """Return the angle of a segment; None for too few periods or too few readings."""
-    segment, position = stretch.segment, recording.position_rad
-    if position is None or len(stretch.periods) < _LEAST_PERIODS:
+    segment, (time, turned) = stretch.segment, readings
+    if len(stretch.periods) < _LEAST_PERIODS:
         return None
-    known = np.isfinite(position) & recording.fresh
-    time, turned = np.asarray(recording.time_s[known], dtype=np.float64), np.asarray(position[known], np.float64)
     begins = [segment.start_s + number * segment.period_s for number in stretch.index]
     spans = [np.searchsorted(time, (begin - 1e-9, begin + segment.period_s - 1e-9)) for begin in begins]
     excited = tuple(round(hertz * segment.period_s) for hertz in segment.lines_hz)

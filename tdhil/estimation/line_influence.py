@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,18 +15,17 @@ from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray
 
 
-def inertia_changes(curve: ModelCurve, theta: FloatArray, torque: ComplexArray) -> FloatArray:
-    """Return the change of J, kg·m², by a torque that is subtracted, as the parts (R,) of the segment means.
-
-    ``torque`` (R,): its line in every segment mean.
+def inertia_changes(curve: ModelCurve, theta: FloatArray, torques: Sequence[ComplexArray]) -> FloatArray:
+    """Return the change of J, kg·m², by each of P torques that are subtracted, as the parts (P, R) of the R segment
+    means. ``torques``: the line of each in every segment mean, (R,).
     """
     problem = curve.fitted.problem
     free, covariance = curve.covariance()
     g, slopes = problem.model.impedance_jacobian(theta, problem.s)
     by = slopes[problem.owner][:, list(free)] * problem.speed[:, None]
     weight = 2.0 * problem.root_periods**2 / problem.variance(g)[problem.owner]
-    scores = (by.conj() * (weight * torque)[:, None]).real
-    found: FloatArray = -scores @ (covariance @ problem.model.inertia_row[list(free)])
+    toward = by.conj() @ (covariance @ problem.model.inertia_row[list(free)])
+    found: FloatArray = -(toward * weight * np.array(torques)).real
     return found
 
 

@@ -260,6 +260,15 @@ def usable_samples(recording: Recording) -> Samples:
     return Samples(time, speed, torque)
 
 
+def angle_readings(recording: Recording) -> tuple[FloatArray, FloatArray] | None:
+    """Return time (N,), s, and reported angle (N,), rad, of all readings; None if the drive reports no angle."""
+    if recording.position_rad is None:
+        return None
+    known = np.isfinite(recording.position_rad) & recording.fresh
+    return (np.asarray(recording.time_s[known], dtype=np.float64),
+            np.asarray(recording.position_rad[known], dtype=np.float64))
+
+
 def excited_window(segment: Segment) -> tuple[float, float]:
     """Return the span from the end of settling to the end of the segment, s."""
     return segment.start_s + segment.settle_periods * segment.period_s, segment.end_s

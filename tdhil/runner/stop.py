@@ -338,7 +338,10 @@ class StopSequence:
         if at_rest_s is not None and not self._wound_up():
             disabled = self._disable(self._loop.drive.disable)
             stays = disabled and self._stays_at_rest()
-        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
+        return self._ended(stays, at_rest_s, disabled)
+
+    def _ended(self, confirmed: bool, at_rest_s: float | None, disabled: bool) -> StopReport:
+        return StopReport(confirmed, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
                           self._stayed_in_torque_mode)
 
     # -- with a drill string -----------------------------------------------------------------------------------
@@ -455,8 +458,7 @@ class StopSequence:
             " in which friction stops the shaft; standstill was not seen"
         )
         self._remove_torque(_NO_TORQUE_ASKED)
-        return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm,
-                          self._stayed_in_torque_mode)
+        return self._ended(False, None, self._torque_removed)
 
     def _ramp_torque_down(self, string: StringReleaseLimits) -> bool:
         """Bring the torque to zero in torque mode. Return whether the drive followed, with a speed that is believed.
@@ -578,8 +580,7 @@ class StopSequence:
             return None
         disabled = self._remove_torque(_NO_TORQUE_ASKED)
         stays = disabled and self._stays_at_rest()
-        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
-                          self._stayed_in_torque_mode)
+        return self._ended(stays, at_rest_s, disabled)
 
     def _take_torque_back(self) -> None:
         """Command zero torque in torque mode before the quick stop.

@@ -207,7 +207,12 @@ class Site:
         self, wanted: RunFilter, order: Order = NEWEST, *, limit: int = 100, offset: int = 0,
     ) -> list[Summary]:
         """Return a part of the runs that meet the conditions, as `list_runs`."""
-        live = self._ahead_of_the_index()
+        return self._find_runs(self._ahead_of_the_index(), wanted, order, limit=limit, offset=offset)
+
+    def _find_runs(
+        self, live: Mapping[str, Summary], wanted: RunFilter, order: Order = NEWEST, *, limit: int, offset: int = 0,
+    ) -> list[Summary]:
+        """Return the same, with the rows of the runs that are ahead of the index."""
         ahead = [one for one in live.values() if wanted.contains(one)]
         first = max(0, offset - len(ahead))        # rows of live runs move a row of the index by their number at most
         try:
@@ -228,8 +233,9 @@ class Site:
         except (sqlite3.Error, OSError):
             total = len(ahead) + sum(wanted.contains(one) for one in self.store.summaries() if one.id not in live)
             choices = {"rig": set(), "verdict": set(), "tags": set()}
-        found = self.find_runs(wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS)
-        newest = wanted.until or next((one.id for one in self.find_runs(RunFilter(archived=True), limit=1)), None)
+        found = self._find_runs(live, wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS)
+        newest = wanted.until or next(
+            (one.id for one in self._find_runs(live, RunFilter(archived=True), limit=1)), None)
         rigs = choices["rig"] | {one.rig for one in live.values() if one.rig}
         return RunsPageView(
             found, total, page, max(1, -(-total // PAGE_RUNS)), (page - 1) * PAGE_RUNS + 1 if found else 0, newest,

@@ -113,7 +113,7 @@ class Observer:
         self._unseen_nms = 0.0
         self._unseen_nm = 0.0
         self._moved = False
-        self._powered = self._coasting = False
+        self._powered = False
         self._left: LeftOperation | None = None
         self._restart()
 
@@ -475,15 +475,14 @@ class Observer:
         if self._powered:
             self._powered = False
             recent = (one.speed for one in self._points if now_s - one.time_s <= POWER_LOSS_S)
-            self._coasting = any(map(self.turns, recent))
-            if self._coasting:
+            if any(map(self.turns, recent)):
                 self._left = LeftOperation(self._points[-1])
-            if self._coasting and not self._bounds.known:
-                self._contradict(Contradiction(
-                    frozenset({Signal.SPEED}), "the drive left operation while the shaft turned, and the inertia is not"
-                    " known yet", "Look at the shaft: the drive may report no speed without torque", now_s,
-                    lag_hides=True))
-        return self._coasting
+                if not self._bounds.known:
+                    self._contradict(Contradiction(
+                        frozenset({Signal.SPEED}), "the drive left operation while the shaft turned, and the inertia is"
+                        " not known yet", "Look at the shaft: the drive may report no speed without torque", now_s,
+                        lag_hides=True))
+        return self._left is not None
 
     def _compare(self, point: Point, command: Command, block_s: float) -> None:
         """Test the momentum balance, and whether the speed responds to the torque."""
