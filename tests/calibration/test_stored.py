@@ -57,7 +57,7 @@ def test_the_file_is_read_again_and_never_written_over(document, tmp_path):
     path = tmp_path / "calibration.json"
     save_calibration(document, path)
     assert load_calibration(path) == json.loads(path.read_text())
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="already exists and was not overwritten"):
         save_calibration(document, path)
 
 

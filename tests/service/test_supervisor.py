@@ -17,6 +17,7 @@ import pytest
 from drivers import CommunicationLost, DataFileError
 from tdhil.errors import LogError, UsageError
 from tdhil.service import supervisor as supervisor_module
+from tdhil.service.limits import STOP_S
 from tdhil.service.run_channel import STOP_FILE, RunRefused
 from tdhil.service.run_state import Conflict, NoRoom, State, Status, now, way_to
 from tdhil.service.store import StoredRequest
@@ -89,7 +90,7 @@ def test_a_service_that_brakes_begins_nothing_more(service):
     loose, run = begun(service, "loose"), begun(service, "hold", "b")
     assert service.supervisor.brake("the end")
     assert service.supervisor.not_at_rest == [loose]
-    assert service.said[0] == (f"Stopping run {loose}, {run}. tdhil waits 60 s at most for standstill."
+    assert service.said[0] == (f"Stopping run {loose}, {run}. tdhil waits {STOP_S:.0f} s at most for standstill."
                                " If a shaft keeps turning, use the hard-wired stop.")
     assert {service.store.status(one).stop.by for one in (loose, run)} == {"the end"}
     with pytest.raises(Conflict, match="service is ending"):
