@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from drivers import CommunicationLost
 from profiles import DataFileError, Profile, load_profile, profile_names
-from tdhil.buses import FoundDrive, bus_named
+from tdhil.buses import FoundDrive, bus_named, required_text
 from tdhil.config import Limits, Rig, parse_rig
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.schemas import (
@@ -46,7 +46,8 @@ def _view(profile: Profile) -> ProfileView:
     return ProfileView(
         profile.name, profile.title, profile.bus, bus_named(profile.bus).title, profile.experimental,
         by_hand(profile), {name: entry.source for name, entry in doubtful(profile)}, profile.rated_torque_by_hand,
-        [FieldView(f"parameters.{one.name}", one.title) for one in profile.untold], _address_fields(profile.bus),
+        [FieldView(f"parameters.{one.name}", one.title, required_text(one.require, "") if one.require else "")
+         for one in profile.untold], _address_fields(profile.bus),
     )
 
 
@@ -82,7 +83,7 @@ def draft_of(body: DraftBody) -> DraftView:
         address={} if body.simulated else _given(body.address), limits=_given(body.limits, LIMIT_KEYS),
         string=_given(body.string, STRING_KEYS) if body.load == "string" else {},
         drive_data={"rated_torque_nm": body.rated_torque_nm.strip()} if body.rated_torque_nm.strip() else {},
-        parameters=_given(body.parameters, tuple(one.name for one in profile.untold)),
+        parameters={} if body.simulated else _given(body.parameters, tuple(one.name for one in profile.untold)),
         gear_ratio=body.gear_ratio.strip() or None,
         accept_unverified=tuple(one for one in body.accept_unverified if one in dict(doubtful(profile))),
         motion="never" if body.simulated else body.motion,      # a simulated rig moves without a rule
@@ -124,13 +125,14 @@ def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[Draft
     if body.simulated:
         return found
     if not known.address:
-        found.append(DraftProblemView("address", "Type the address of the drive. Without one,"
-                                                 " the embedded simulator runs."))
-    found += [DraftProblemView(f"limits.{name}", "A real drive does not move without it.") for name in LIMIT_KEYS
-              if name not in known.limits]
+        found.append(DraftProblemView("address", "Type the address of the drive. For a rig without a drive, select"
+                                                 " Simulated."))
+    found += [DraftProblemView(f"limits.{name}", "Type this limit. A real drive does not move without it.")
+              for name in LIMIT_KEYS if name not in known.limits]
     if profile.rated_torque_by_hand and not known.drive_data:
-        found.append(DraftProblemView("rated_torque_nm", "The drive does not report it: type it from the name plate."))
-    found += [DraftProblemView(f"parameters.{one.name}", "The drive does not report it over the bus.")
+        found.append(DraftProblemView("rated_torque_nm", "Type it from the name plate. The drive does not report it."))
+    found += [DraftProblemView(f"parameters.{one.name}", "Read this value at the drive, and type it. The drive does not"
+                                                         " report it over the bus.")
               for one in profile.untold if one.name not in known.parameters]
     open_entries = [name for name, _ in doubtful(profile) if name not in known.accept_unverified]
     if open_entries:

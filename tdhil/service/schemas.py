@@ -55,10 +55,11 @@ class RigView:
 
 @dataclass(frozen=True)
 class FieldView:
-    """A key of a rig's file, with its unit and meaning."""
+    """A key of a rig's file, with its unit and meaning, and what the drive has to have there: empty for any value."""
 
     name: str
     description: str
+    required: str = ""
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,8 @@ def serve(
                              next_step="For example http://localhost:8080, or file://",
                              entry=MessageCode.SERVICE_OPTION_WRONG)
     if rigs is not None and not rigs.is_dir():
-        raise UsageError("this folder does not exist", where=f"--rigs {rigs}", next_step="Name a folder of rig files",
+        raise UsageError("this folder does not exist", where=f"--rigs {rigs}",
+                         next_step="Create it for your rig files (mkdir), or name another folder",
                          entry=MessageCode.FILE_NOT_FOUND)
     if missing := [folder for folder in logs if not folder.is_dir()]:
         raise UsageError("this folder does not exist", where=f"--logs {missing[0]}", next_step="Name a folder of logs",

@@ -66,17 +66,28 @@ def test_a_simulated_rig_may_have_the_limits_of_the_real_one():
         "name", *STRING}
 
 
+def test_a_simulated_drive_is_asked_for_no_parameter():
+    found = draft_of(complete("siemens/g120", simulated=True))
+    assert found.problems == [] and not parse_rig(found.text, "rig.yaml").drive_data.parameters
+
+
+def test_a_parameter_is_shown_with_the_value_that_it_must_have():
+    view = next(one for one in new_rig_view().profiles if one.name == "siemens/g120")
+    required = {one.name: one.required for one in view.parameters}
+    assert required["parameters.control_mode"] == "20" and required["parameters.reference_torque"] == ""
+
+
 def fields_of(**changed):
     return {one.field: one.message for one in draft_of(complete("maxon/epos4", **changed)).problems}
 
 
 @pytest.mark.parametrize(("changed", "field", "said"), [
     ({"name": "  "}, "name", "its own name"),
-    ({"address": {}}, "address", "the embedded simulator runs"),
+    ({"address": {}}, "address", "select Simulated"),
     ({"address": ADDRESS["canopen"] | {"node": "300"}}, "address.node", "Must be at most 127"),
     ({"address": ADDRESS["canopen"] | {"bitrate": "77"}}, "address.bitrate", "is not a CAN bit rate"),
     ({"limits": LIMITS | {"torque_nm": ""}}, "limits.torque_nm", "does not move without it"),
-    ({"limits": LIMITS | {"speed_max_rad_s": "95 rpmm"}}, "limits.speed_max_rad_s", "'rpmm' is no unit"),
+    ({"limits": LIMITS | {"speed_max_rad_s": "95 rpmm"}}, "limits.speed_max_rad_s", "'rpmm' is not a unit"),
     ({"limits": LIMITS | {"probe_torque_nm": "900"}}, "limits.probe_torque_nm", "Must not be above torque_nm"),
     ({"string": {}}, "make_up_torque_nm", "A drill string needs it"),
     ({"accept_unverified": []}, "accept_unverified", "accept them: modes, quick_stop"),

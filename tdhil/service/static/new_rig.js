@@ -53,7 +53,7 @@
     }
     const { machine, profiles } = loaded;
     const byName = new Map(profiles.map((one) => [one.name, one]));
-    const input = (name, label) => el("label", { "data-field": name }, label, el("input", { name, autocomplete: "off", autocapitalize: "none", spellcheck: "false" }));
+    const input = (name, label, placeholder = "") => el("label", { "data-field": name }, label, el("input", { name, placeholder, autocomplete: "off", autocapitalize: "none", spellcheck: "false" }));
 
     const capital = (text) => `${text.charAt(0).toUpperCase()}${text.slice(1)}`;
     /** Label of a key of the machine: "N·m; highest torque" is "Highest torque, N·m". */
@@ -68,9 +68,8 @@
     function profileChanged() {
       const one = chosen();
       show(byId("address"), ...one.address.map((key) => input(`address.${key.name}`, place(key))));
-      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, tr("{quantity}, which the drive does not report", { quantity: word(key.description) }))));
+      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, tr("{quantity}, as read at the drive", { quantity: word(key.description) }), key.required && tr("required: {value}", { value: key.required }))));
       byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it was reported yet.") : "";
-      byId("rated").hidden = !one.rated_torque_by_hand;
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
         one.by_hand.length ? el("p", {}, tr("Make these settings at the drive. A run is refused until it reads them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
@@ -86,13 +85,15 @@
       const simulated = field("simulated").checked;
       for (const one of form.querySelectorAll("[data-real]")) one.hidden = simulated;
       byId("limits-hint").hidden = !simulated;
+      byId("rated").hidden = simulated || !chosen().rated_torque_by_hand;
     }
-    field("profile").addEventListener("change", profileChanged);
+    field("profile").addEventListener("change", () => { profileChanged(); simulatedChanged(); });
     field("simulated").addEventListener("change", simulatedChanged);
     field("load").addEventListener("change", loadChanged);
     field("profile").value = byName.has("generic/cia402") ? "generic/cia402" : profiles[0].name;
     profileChanged();
     loadChanged();
+    simulatedChanged();
 
     const fields = () => [...form.elements].filter((one) => one.name && !["BUTTON", "TEXTAREA"].includes(one.tagName));
     const keyOf = (one) => (one.name === "accept" ? `accept:${one.value}` : one.name);

@@ -95,7 +95,7 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     box("Highest speed").fill("95 rpmm")
     page.get_by_role("button", name="Save the rig").click()
     page.get_by_text("entries need a correction").wait_for()
-    assert "is no unit of a speed" in box("Highest speed").locator("xpath=..").inner_text()
+    assert "is not a unit of speed" in box("Highest speed").locator("xpath=..").inner_text()
     page.locator("[data-field=accept_unverified] .wrong").wait_for()         # a mistake that has no field of its own
     assert not (rigs / "bench-3.yaml").exists()
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, sent: {"document": {
