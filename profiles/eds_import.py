@@ -63,7 +63,7 @@ def _refuse_unless_possible(eds: EdsFile, path: str) -> None:
     for index, (said, kind_wanted) in must.items():
         one = eds.get(index)
         if one is not None and one.type != kind_wanted:
-            problems.append(Problem(path, one.line, f"{index:04X}h ({said}) is {one.type}: {kind_wanted} is wanted"))
+            problems.append(Problem(path, one.line, f"{index:04X}h ({said}) is {one.type}: must be {kind_wanted}"))
     if problems:
         raise DataFileError(tuple(problems))
 

@@ -174,11 +174,11 @@ class _Reader:
         try:
             found = int(text, 0)
         except ValueError:
-            said = "is empty: a number is wanted" if not text else f"is {_shown(text)}: a number is wanted"
+            said = "is empty: must be a number" if not text else f"is {_shown(text)}: must be a number"
             self.refuse(section.lines[key], f"{key} {said}, such as 251 or 0xFB (0 where the maker doesn't tell it)")
             return None
         if not low <= found <= high:
-            self.refuse(section.lines[key], f"{key} is {_shown(text)}: from {low} to {high} is wanted")
+            self.refuse(section.lines[key], f"{key} is {_shown(text)}: must be from {low} to {high}")
             return None
         return found
 
@@ -244,7 +244,7 @@ class _Reader:
             try:
                 number = _number(text, data_type)
             except ValueError:
-                self.refuse(section.lines[key], f"{key} of {name} is {_shown(text)}: a number of its type is wanted")
+                self.refuse(section.lines[key], f"{key} of {name} is {_shown(text)}: must be a number of its type")
             else:
                 found[field_name] = number
         return found

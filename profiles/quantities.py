@@ -201,24 +201,20 @@ def split(text: str) -> tuple[float, str] | None:
     return (value, (found[2] or "").strip()) if math.isfinite(value) else None
 
 
-def _a(noun: str) -> str:
-    return f"an {noun}" if noun[0] in "aeiou" else f"a {noun}"
-
-
 def read(text: str, unit: Unit) -> float:
     """Return the quantity ``text`` in ``unit``. A number alone is in ``unit``. Raises ValueError with a text for the
     user, which repeats no number.
     """
     parts = split(text)
     if parts is None:
-        raise ValueError(f"a number and its unit are wanted, such as '3 {example(unit)}'")
+        raise ValueError(f"must be a number and its unit, such as '3 {example(unit)}'")
     value, word = parts
     given = unit_of(word) if word else unit
     if given is None:
-        raise ValueError(f"'{word}' is no unit of {_a(unit.dimension)} that is known; known: {', '.join(known(unit))}")
+        raise ValueError(f"'{word}' is not a unit of {unit.dimension}; use {', '.join(known(unit))}")
     if given.dimension != unit.dimension:
-        raise ValueError(f"{given.symbol} is a unit of {given.dimension}, but {_a(unit.dimension)} is wanted; "
-                         f"known: {', '.join(known(unit))}")
+        raise ValueError(f"{given.symbol} is a unit of {given.dimension}, not of {unit.dimension}; "
+                         f"use {', '.join(known(unit))}")
     converted = value if given == unit else unit.of_si(given.si(value))
     if not math.isfinite(converted):
         raise ValueError("too large for a number")

@@ -166,21 +166,21 @@ def _wanted(kinds: list[str], tree: Tree, path: KeyPath) -> str:
     wanted = " or ".join(dict.fromkeys(_WANTED[kind] for kind in kinds))
     value = _value(tree.data, path)
     if value is None:
-        return f"has no value; {wanted} is wanted here"
-    return f"{wanted} is wanted, not {_shown(value)}{_advice(kinds[0], value, path)}"
+        return f"has no value; must be {wanted}"
+    return f"must be {wanted}, not {_shown(value)}{_advice(kinds[0], value, path)}"
 
 
 def _wrong_value(item: dict[str, Any], value: Any, written: str | None) -> str:
     kind, context = item["type"], item.get("ctx", {})
     if kind in {"literal_error", "enum"}:
         choices = [choice.strip("' ") for choice in context["expected"].replace(" or ", ", ").split(",")]
-        return f"{context['expected']} is wanted, not {_shown(value)}{_meant(str(value), choices, listed=False)}"
+        return f"must be {context['expected']}, not {_shown(value)}{_meant(str(value), choices, listed=False)}"
     if kind in _BOUNDS:
         as_written = f"{value:.4g} ({_clean(written)})" if written else ""
         return f"must be {_BOUNDS[kind][1]} {context[_BOUNDS[kind][0]]:g}, not {as_written or _shown(value)}"
     if kind in {"too_short", "too_long"}:
         limit = context.get("min_length", context.get("max_length"))
-        return f"{'at least' if kind == 'too_short' else 'at most'} {limit} entries are wanted"
+        return f"must have {'at least' if kind == 'too_short' else 'at most'} {limit} entries"
     return str(item["msg"]).removeprefix("Value error, ")
 
 
@@ -209,9 +209,9 @@ def _unit_advice(text: str, path: KeyPath) -> str:
     key = next((part for part in reversed(path) if isinstance(part, str)), "")
     unit = quantities.unit_of_key(key)
     if unit is None and key.endswith(("length_m", "diameter_m")):
-        return "; a number alone, of metres"
+        return "; write the number alone, in metres"
     if unit is None:
-        return "; a number alone: this key has no unit"
+        return "; write the number alone: this key has no unit"
     try:
         quantities.read(text, unit)
     except ValueError as error:
@@ -380,7 +380,7 @@ def _key(tree: Tree, path: KeyPath, known: set[str]) -> list[Conversion]:
         problem = f"{_key_path(path)}: '{key}' and '{ours}' (line {other}) are the same quantity; keep one"
         return _refused(tree, path, problem)
     if isinstance(written, bool) or not isinstance(written, int | float | str):
-        return _refused(tree, path, f"{_key_path(path)}: a number in {unit.symbol} is wanted", there)
+        return _refused(tree, path, f"{_key_path(path)}: must be a number in {unit.symbol}", there)
     try:
         value = float(written) if not isinstance(written, str) else _in_unit(written, unit)
     except ValueError as error:
@@ -394,9 +394,9 @@ def _key(tree: Tree, path: KeyPath, known: set[str]) -> list[Conversion]:
 def _in_unit(text: str, unit: Unit) -> float:
     parts = quantities.split(text)
     if parts is None:
-        raise ValueError(f"a number in {unit.symbol} is wanted")
+        raise ValueError(f"must be a number in {unit.symbol}")
     if not parts[1]:
-        raise ValueError("a number is wanted, without quotes")
+        raise ValueError("must be a number without quotes")
     given = quantities.unit_of(parts[1])
     if given is not None and given.dimension == unit.dimension and given != unit:
         raise ValueError(f"the key says {unit.symbol}, the value {given.symbol}; keep one of them")

@@ -108,7 +108,7 @@ def _rigid_unless_said(section: Any) -> Any:
     if not isinstance(kind, str) or kind not in PLANTS:
         *first, last = PLANTS
         shown = kind if isinstance(kind, str | int | float) else "a list or section"
-        refuse_if([("kind", f"{', '.join(first)} or {last} is wanted, not {shown}")])
+        refuse_if([("kind", f"must be {', '.join(first)} or {last}, not {shown}")])
     foreign = {
         key: [other for other, one in PLANTS.items() if key in one.params.model_fields]
         for key in section if key not in PLANTS[kind].params.model_fields

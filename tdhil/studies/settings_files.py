@@ -58,7 +58,7 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
     for assignment in assignments:
         name, sign, text = (part.strip() for part in assignment.partition("="))
         if not (name and sign and text):
-            raise UsageError(f"--set {assignment}: name=value is wanted", next_step="For example --set Kp=3000",
+            raise UsageError(f"--set {assignment}: must be name=value", next_step="For example --set Kp=3000",
                              entry=MessageCode.STUDY_SETTING_WRONG)
         *sections, last = name.split(".")
         field = last if sections else _field(name, settings)
@@ -66,7 +66,7 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
             _refuse_varied(settings, field, assignment)
         tree = read_tree(f"value: {text}", "--set")
         if tree.problems or not isinstance(tree.data, dict) or list(tree.data) != ["value"]:
-            why = tree.problems[0].message if tree.problems else "one value is wanted"
+            why = tree.problems[0].message if tree.problems else "must be one value"
             raise UsageError(f"--set {assignment}: {why}", entry=MessageCode.STUDY_SETTING_WRONG)
         place: Any = data
         for section in sections:

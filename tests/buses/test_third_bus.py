@@ -225,7 +225,7 @@ def test_rig_yaml_takes_the_section_of_the_toy_bus(toy_bus, capsys):
     assert "peg 7: nobody there" in capsys.readouterr().err
     for text, said in (("toy: {peg: 700}\n", "rig.yaml:1: toy.peg: must be at most 99, not 700"),
                        ("toy:\n  pig: 7\n", "rig.yaml:2: toy: unknown key 'pig'; did you mean 'peg'?"),
-                       ("drive: toi\n", f"{', '.join(map(repr, [*BUSES][:-1]))} or 'toy' is wanted")):
+                       ("drive: toi\n", f"{', '.join(map(repr, [*BUSES][:-1]))} or 'toy'")):
         Path("rig.yaml").write_text(text)
         with pytest.raises(DataFileError) as caught:
             load_rig(Path("rig.yaml"))

@@ -123,7 +123,7 @@ def test_what_a_toy_excitation_says_of_itself_is_heeded():
 def test_a_trace_may_have_been_excited_by_a_toy_that_is_periodic():
     segment = "\nsegments: [{start_s: 0, periods: 3, period_s: 10, offset_rad_s: 2, lines_hz: [0.1, 0.3]}]\n"
     assert parse_model(f"kind: two-tones{segment}", "excitation.yaml", ExcitationFile).kind == "two-tones"
-    with pytest.raises(DataFileError, match=r"'multisine', 'sine', 'step'.* or 'two-tones' is wanted"):
+    with pytest.raises(DataFileError, match=r"'multisine', 'sine', 'step'.* or 'two-tones'"):
         parse_model(f"kind: stairs{segment}", "excitation.yaml", ExcitationFile)
 
 
@@ -186,7 +186,7 @@ def test_a_toy_plant_is_read_and_turned(monkeypatch):
     assert turned.speed_rad_s == pytest.approx(100.0 / (params.inertia_kg_m2 + 900.0))
     with pytest.raises(DataFileError, match=r"plant\.wheel_kg_m2: belongs to kind: flywheel, and this plant is rigid"):
         parse_model("plant: {wheel_kg_m2: 3}\n", "plant.yaml", RigParams)
-    with pytest.raises(DataFileError, match=r"rigid, two_mass, .* or flywheel is wanted, not fly"):
+    with pytest.raises(DataFileError, match=r"must be rigid, two_mass, .* or flywheel, not fly"):
         parse_model("plant: {kind: fly}\n", "plant.yaml", RigParams)
     with pytest.raises(DataFileError, match="wheel_kg_m2: must be greater than 0, not -1"):
         parse_model("plant: {kind: flywheel, wheel_kg_m2: -1.0}\n", "plant.yaml", RigParams)
@@ -227,10 +227,10 @@ def test_a_wrong_name_is_refused_as_a_literal_is(registry, wrong):
 def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
     rig = tmp_path / "rig.yaml"
     rig.write_text("run:\n  excitation: multisin\n")
-    with pytest.raises(DataFileError, match=r"rig.yaml:2: run.excitation: 'multisine', .* or '[a-z-]+' is wanted, "
+    with pytest.raises(DataFileError, match=r"rig.yaml:2: run.excitation: must be 'multisine', .* or '[a-z-]+', "
                                             r"not the text 'multisin'; did you mean 'multisine'\?"):
         load_rig(rig)
-    wanted = r"^excitation: 'multisine', .* or '[a-z-]+' is wanted"
+    wanted = r"^excitation: must be 'multisine', .* or '[a-z-]+', not"
     with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match=wanted):
         tdhil.run(drive, tdhil.Motion("noise"), log=tmp_path / "run.mcap")
     assert main(["identify", "--excitation", "noise"]) == 2

@@ -59,19 +59,19 @@ def test_a_key_in_the_manual_s_unit(tmp_path, ours, key, written, value):
 @pytest.mark.parametrize(("limits", "more", "line", "words"), [
     ({"speed_max_rpm": "100"}, "", 10, "'speed_max_rpm' and 'speed_max_rad_s' (line 3) are the same quantity"),
     ({"speed_max_rad_s": "", "speed_max_rpm": "100 rad/s"}, "", 9, "the key says rpm, the value rad/s"),
-    ({"speed_max_rad_s": "", "speed_max_rpm": "fast"}, "", 9, "a number in rpm is wanted"),
-    ({"speed_max_rad_s": "100 1/s"}, "", 3, "'1/s' is no unit of a speed"),
-    ({"speed_max_rad_s": "15 min"}, "", 3, "min is a unit of time, but a speed is wanted"),
-    ({"torque_nm": "50 %"}, "", 4, "% is a unit of share, but a torque is wanted"),
+    ({"speed_max_rad_s": "", "speed_max_rpm": "fast"}, "", 9, "must be a number in rpm"),
+    ({"speed_max_rad_s": "100 1/s"}, "", 3, "'1/s' is not a unit of speed"),
+    ({"speed_max_rad_s": "15 min"}, "", 3, "min is a unit of time, not of speed"),
+    ({"torque_nm": "50 %"}, "", 4, "% is a unit of share, not of torque"),
     ({"torque_nm": "2 kNm", "probe_torque_nm": "3 kNm"}, "", 8, "must not be above torque_nm, which is 2000"),
     ({"speed_max_rad_s": "1e9 rpm"}, "", 3, "must be at most 100000, not 1.047e+08 (1e9 rpm)"),
-    ({"probe_travel_rad": "3 furlong"}, "", 9, "is no unit of an angle that is known"),
+    ({"probe_travel_rad": "3 furlong"}, "", 9, "is not a unit of angle"),
     ({"torque_nm": "1e308"}, "", 4, "must be at most 1e+07"),
-    ({}, "run: {seed: 500k}", 10, "a number alone: this key has no unit"),
-    ({}, "run: {periods: 5 periods}", 10, "a number alone: this key has no unit"),
+    ({}, "run: {seed: 500k}", 10, "write the number alone: this key has no unit"),
+    ({}, "run: {periods: 5 periods}", 10, "write the number alone: this key has no unit"),
     ({}, "bus: {bitrate: 500}", 10, "500 bit/s is not a CAN bit rate; 500k is one: 500000"),
     ({}, "bus: {bitrate: 240k}", 10, "the nearest is 250000"),
-    ({}, "bus: {bitrate: 15 min}", 10, "a bit rate is wanted"),
+    ({}, "bus: {bitrate: 15 min}", 10, "not of bit rate"),
 ])
 def test_what_is_refused_offers_no_wrong_number(tmp_path, limits, more, line, words):
     with pytest.raises(DataFileError) as caught:
@@ -142,4 +142,4 @@ def test_options_take_units(capsys):
     )
     with pytest.raises(SystemExit):
         parser.parse_args(["--amplitude", "15 Hz"])
-    assert "Hz is a unit of frequency, but a speed is wanted" in capsys.readouterr().err
+    assert "Hz is a unit of frequency, not of speed" in capsys.readouterr().err

@@ -185,7 +185,7 @@ def test_a_log_is_known_by_its_content(run, tmp_path):
 
 @pytest.mark.parametrize(("arguments", "said"), [
     (("--columns", "speed=n_rmp:rpm"), "no column 'n_rmp'"),
-    (("--columns", "speed=n:rmp"), "'rmp' is no unit of speed"),
+    (("--columns", "speed=n:rmp"), "'rmp' is not a unit of speed"),
     (("--columns", "torque=torque_nm:%"), "--rated-torque"),
     (("--rated-torque", "0"), "--rated-torque"),
     (("--gear", "nan"), "--gear"),

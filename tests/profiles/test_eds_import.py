@@ -253,8 +253,8 @@ def line_of(text, start):
 
 
 @pytest.mark.parametrize(("old", "new", "at", "words"), [
-    ("VendorNumber=0xAB", "VendorNumber=", "VendorNumber", "VendorNumber is empty: a number is wanted"),
-    ("VendorNumber=0xAB", "VendorNumber=none", "VendorNumber", "'none': a number is wanted"),
+    ("VendorNumber=0xAB", "VendorNumber=", "VendorNumber", "VendorNumber is empty: must be a number"),
+    ("VendorNumber=0xAB", "VendorNumber=none", "VendorNumber", "'none': must be a number"),
     ("VendorNumber=0xAB", "VendorNumber=-1", "VendorNumber", "from 0 to"),
     ("ProductNumber=0x1234", "ProductNumber=0x123456789", "ProductNumber", "from 0 to"),
     ("[606C]", "[606C", "[606C", "between [ and ]"),
@@ -280,9 +280,9 @@ def test_a_mistake_is_named_with_its_line(begin, old, new, at, words):
     (b"[DeviceInfo]\nVendorName=a\0b\n", "zero bytes"), ("[DeviceInfo]\n", "no CiA 402 drive"),
     (eds(drop=(0x60FF,)), "60FFh (target velocity)"),
     (eds({(0x6042, 0): (I16, "rw", 1, "0")}, drop=(0x60FF,)), "6044h (vl velocity actual)"),
-    (eds({(0x6042, 0): (I32, "rw", 1, "0"), (0x6044, 0): (I16, "ro", 1, "")}, drop=(0x60FF,)), "is i32: i16 is wanted"),
+    (eds({(0x6042, 0): (I32, "rw", 1, "0"), (0x6044, 0): (I16, "ro", 1, "")}, drop=(0x60FF,)), "is i32: must be i16"),
     (eds({(0x1000, 0): (U32, "ro", 0, "0x00030191")}), "device profile 401"),
-    (eds({(0x60FF, 0): (I16, "rw", 1, "0")}), "is i16: i32 is wanted"),
+    (eds({(0x60FF, 0): (I16, "rw", 1, "0")}), "is i16: must be i32"),
     (eds(extra="[606C]\nParameterName=again\nDataType=7\nAccessType=ro\n"), "a second time; first in line"),
     (eds(extra="[OptionalObjects]\nSupportedObjects=1\n1=0x6099\n"), "lists 0x6099, which no section [6099] describes"),
     (eds(extra="[2001]\nParameterName=x\nObjectType=77\n"), "ObjectType is 77"),

@@ -59,7 +59,7 @@ def test_names_reach_no_other_file(name: str) -> None:
 def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(GENERIC.replace("generic/cia402", "mine/drive").replace("product: null", "product: 0x6552_0000"))
-    with pytest.raises(DataFileError, match=r"mine\.yaml:\d+: identity\.product: a whole number is wanted"):
+    with pytest.raises(DataFileError, match=r"mine\.yaml:\d+: identity\.product: must be a whole number"):
         load_profile(str(path))
     path.write_text(GENERIC.replace("generic/cia402", "mine/drive").replace("vendor: null", "vendor: 0xFB"))
     assert load_profile(str(path)).identity.vendor == 0xFB
@@ -77,10 +77,10 @@ def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
         ("reaction: quick_stop", "reaction: none", "say what the drive does"),
         ("kind: heartbeat", "kind: none", "must be none"),
         ("kind: heartbeat", "kind: heatbeat", "did you mean 'heartbeat'?"),
-        ("confidence: verified", "confidence: sure", "'verified', 'likely' or 'unverified' is wanted"),
+        ("confidence: verified", "confidence: sure", "must be 'verified', 'likely' or 'unverified', not"),
         ("eds: cia402.eds", "eds: ../x.eds", "plain name"),
         ("rpm_per_lsb: 0.1", "rpm_per_lsb: 0", "greater than 0"),
-        ("bus: canopen", "bus: profibus", f"{', '.join(map(repr, [*SCHEMAS][:-1]))} or {[*SCHEMAS][-1]!r} is wanted"),
+        ("bus: canopen", "bus: profibus", f"{', '.join(map(repr, [*SCHEMAS][:-1]))} or {[*SCHEMAS][-1]!r}, not"),
     ],
 )
 def test_wrong_profiles(tmp_path: Path, old: str, new: str, words: str) -> None:

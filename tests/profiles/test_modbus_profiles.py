@@ -141,7 +141,7 @@ def test_the_file_begins_with_what_is_special(name: str) -> None:
     ("old", "new", "words"),
     [
         ("family: profidrive", "family: profibus", "family"),
-        ("confidence: verified", "confidence: sure", "'verified', 'likely' or 'unverified' is wanted"),
+        ("confidence: verified", "confidence: sure", "must be 'verified', 'likely' or 'unverified', not"),
         ("times: reference_torque", "times: reference_tork", "no parameter 'reference_tork'"),
         ("parameter: monitoring_time", "parameter: p2040", "no parameter 'p2040'"),
         ("torque: true", "torque: false", "none where torque is false"),

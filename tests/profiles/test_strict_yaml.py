@@ -38,7 +38,7 @@ def refused(text: str) -> list[tuple[int, str]]:
 
 
 def test_where_a_number_is_wanted_no_truth_value_is_advised() -> None:
-    assert refused("a: yes") == [(1, "a: a number is wanted, not the text 'yes'")]
+    assert refused("a: yes") == [(1, "a: must be a number, not the text 'yes'")]
 
 
 @pytest.mark.parametrize(
@@ -84,15 +84,15 @@ def test_what_is_read(text: str, key: str, value: object) -> None:
         ("a: 1_000", 1, "write 1000"),
         ("a: 12:30", 1, "without ':'"),
         ("a: 1,5", 1, "a decimal point"),
-        ("a: 5 Nm", 1, "a number alone: this key has no unit"),
+        ("a: 5 Nm", 1, "write the number alone: this key has no unit"),
         ("a: '5'", 1, "write 5 without quotes"),
         ("a: .nan", 1, "finite"),
         ("a: -.Inf", 1, "finite"),
         ("a: 1e999", 1, "too large"),
         ("a: " + "9" * 5000, 1, "characters"),
-        ("n: 1e3", 1, "a whole number is wanted, not 1000.0; write 1000"),
-        ("n: 1.5", 1, "a whole number is wanted, not 1.5"),
-        ("n: true", 1, "a whole number is wanted, not true"),
+        ("n: 1e3", 1, "must be a whole number, not 1000.0; write 1000"),
+        ("n: 1.5", 1, "must be a whole number, not 1.5"),
+        ("n: true", 1, "must be a whole number, not true"),
         ("b: on", 1, "write true"),
         ("b: No", 1, "write false"),
         ("b: 1", 1, "write true or false"),
@@ -133,7 +133,7 @@ def test_what_is_read(text: str, key: str, value: object) -> None:
         ("part:\n  torque_nm: 1\n  kind: sting", 3, "did you mean 'string'?"),
         ("part:\n  torque_nm: 1\n  pair: 3", 3, "a list"),
         ("parts:\n  - torque_nm: 1\n  - torque_nm:", 3, "parts[1].torque_nm: has no value"),
-        ("options:\n  x: [1]", 2, "text or a whole number or a number or true or false is wanted, not a list"),
+        ("options:\n  x: [1]", 2, "must be text or a whole number or a number or true or false, not a list"),
     ],
 )
 def test_what_is_refused(text: str, line: int, words: str) -> None:

@@ -118,14 +118,14 @@ REFUSED = {
     "misspelt": ("t_s,n_rpm,m\n0,1,2\n", ("time=t_s", "speed=n_rmp:rpm", "torque=m"), 2, "did you mean 'n_rpm'?"),
     "misspelt, usual": ("time_s,sped_rad_s,torque_nm\n0,1,2\n", (), 2, "trace.csv:1: no column is called speed"),
     "twice": ("time_s,n,n,torque_nm\n0,1,2,3\n", ("speed=n",), 2, "2 columns could be speed"),
-    "unknown unit below": ("time_s,n,torque_nm\ns,furlong,Nm\n0,1,2\n", ("speed=n",), 2, "'furlong' is no known unit"),
+    "unknown unit below": ("time_s,n,torque_nm\ns,furlong,Nm\n0,1,2\n", ("speed=n",), 2, "is not a unit of speed"),
     "unknown unit in the name": ("time_s,speed_rad_s,Torque [% Mn]\n0,1,2\n", (), 2,
-                                 "'% Mn' is no known unit of torque, in column 'Torque [% Mn]'; there are N·m, mN·m"),
+                                 "'% Mn', of column 'Torque [% Mn]', is not a unit of torque; use N·m, mN·m"),
     "unknown unit of the speed": ("time_s,Speed [0.1 rpm],torque_nm\n0,1,2\n", (), 2,
                                   "Give it behind a colon: --columns speed='Speed [0.1 rpm]:rad/s'"),
-    "mega and not milli": ("time_s,speed_rad_s,torque [MNm]\n0,1,2\n", (), 2, "'MNm' is no known unit of torque"),
+    "mega and not milli": ("time_s,speed_rad_s,torque [MNm]\n0,1,2\n", (), 2, "is not a unit of torque"),
     "unknown units below": ("time,speed,torque\n[tick],[inc],[1/1000 Mn]\n0,1,2\n", (), 2,
-                            "'[tick]' is no known unit of time"),
+                            "is not a unit of time"),
     **{f"only a setpoint: {name}": (f"time_s,speed_rad_s,{name}\n0,1,2\n", (), 2,
                                     f"no column holds the actual torque. By name, '{name}' is a setpoint, a limit or "
                                     "an error")
@@ -168,8 +168,9 @@ def test_what_is_no_text_is_told(tmp_path, head):
 
 
 @pytest.mark.parametrize(("item", "words"), [
-    ("speed", "is not quantity=column"), ("sped=n", "did you mean 'speed'?"), ("speed=n:furlong", "no unit of speed"),
-    ("speed=n:Nm", "no unit of speed"), ("torque=", "is not quantity=column"), ("torque=:Nm", "no unit of torque"),
+    ("speed", "is not quantity=column"), ("sped=n", "did you mean 'speed'?"), ("torque=", "is not quantity=column"),
+    ("speed=n:furlong", "not a unit of speed"), ("speed=n:Nm", "not a unit of speed"),
+    ("torque=:Nm", "not a unit of torque"),
 ])
 def test_a_wrong_choice_of_columns_is_a_usage_error(item, words):
     with pytest.raises(UsageError, match=words) as caught:

@@ -87,14 +87,14 @@ def test_a_file_from_before_there_were_kinds_is_rigid() -> None:
 
 
 @pytest.mark.parametrize(("text", "says"), [
-    ("kind: twomass", f"plant.kind: {', '.join([*PLANTS][:-1])} or {[*PLANTS][-1]} is wanted, not twomass"),
-    ("kind: [two_mass]", " is wanted, not a list or section"),
+    ("kind: twomass", f"plant.kind: must be {', '.join([*PLANTS][:-1])} or {[*PLANTS][-1]}, not twomass"),
+    ("kind: [two_mass]", ", not a list or section"),
     ("stiffness_nm_rad: 3", "plant.stiffness_nm_rad: belongs to kind: two_mass, and this plant is rigid"),
     ("kind: string\n  damping_nm_s_rad: 3", "plant.damping_nm_s_rad: belongs to kind: two_mass, and this plant is"),
     ("bottom: {coulomb_nm: 3}", "plant.bottom: belongs to kind: two_mass or string, and this plant is rigid"),
     ("kind: two_mass\n  stiffnes_nm_rad: 3", "unknown key 'stiffnes_nm_rad'; did you mean 'stiffness_nm_rad'?"),
     ("kind: two_mass\n  bottom:\n    friction: lugr",
-     f"plant.bottom.friction: {', '.join(map(repr, FRICTIONS[:-1]))} or {FRICTIONS[-1]!r} is wanted"),
+     f"plant.bottom.friction: must be {', '.join(map(repr, FRICTIONS[:-1]))} or {FRICTIONS[-1]!r}, not"),
     ("friction: stribeck\n  static_nm: 10", "plant.static_nm: breakaway torque can't be below coulomb_nm (60)"),
     ("kind: string\n  length_m: 1", "plant.length_m: waves would take"),
 ])

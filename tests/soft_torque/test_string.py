@@ -53,7 +53,7 @@ def test_a_file_is_read_from_the_top_down(tmp_path):
     ("  coulomb_nm: 2500\n", "", 5, "friction: stribeck needs it"),
     ("coulomb_nm: 2500", "coulomb_nm: 5500", 9, "must not be below coulomb_nm"),
     ("friction: stribeck", "friction: coulomb", 9, "belongs to friction: stribeck"),
-    ("length_m: 200,", "length_m: 200 m,", 4, "a number alone, of metres"),
+    ("length_m: 200,", "length_m: 200 m,", 4, "write the number alone, in metres"),
 ])
 def test_mistakes_are_named_with_their_line(tmp_path, old, new, line, words):
     with pytest.raises(DataFileError) as caught:

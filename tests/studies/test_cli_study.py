@@ -224,8 +224,8 @@ def test_the_seed(studies):
 
 @pytest.mark.parametrize(("arguments", "said"), [
     (("table1", "--set", "kq_nm_s_rad=3"), "did you mean 'kp_nm_s_rad'?"),
-    (("table1", "--set", "Kp"), "name=value is wanted"),
-    (("table1", "--set", "Kp=many"), "a number is wanted, not the text 'many'"),
+    (("table1", "--set", "Kp"), "must be name=value"),
+    (("table1", "--set", "Kp=many"), "must be a number, not the text 'many'"),
     (("table1", "--set", "Kp=-1"), "must be greater than 0"),
     (("table1", "--set", "tones_hz=[0.1"), "--set tones_hz=[0.1"),
     (("table1", "figure2", "--set", "Kp=3"), "Name one study"),
@@ -242,7 +242,7 @@ def test_a_bad_setting_ends_with_one_line_and_exit_2(studies, tmp_path, argument
 
 
 @pytest.mark.parametrize(("text", "said"), [
-    ("study: table1\nsettings:\n  kp_nm_s_rad: fast\n", "my.yaml:3: settings.kp_nm_s_rad: a number is wanted"),
+    ("study: table1\nsettings:\n  kp_nm_s_rad: fast\n", "my.yaml:3: settings.kp_nm_s_rad: must be a number"),
     ("study: table1\nsettings:\n  kp: 3\n", "my.yaml:3: settings: unknown key 'kp'"),
     ("study: tabel1\n", "my.yaml:1: study: no study 'tabel1'"),
     ("study: figure2\n", "the file is for figure2"),

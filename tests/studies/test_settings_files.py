@@ -45,7 +45,7 @@ def test_a_file_changes_what_it_names_and_keeps_the_rest(load):
     ("settings: {}\n", 1, "'study' is missing"),
     ("study: table7\nsetting: {}\n", 2, "unknown key 'setting'"),
     ("study: table7\nsettings:\n  kp: 3\n", 3, "unknown key 'kp'"),
-    ("study: table7\nsettings:\n  kp_nm_s_rad: fast\n", 3, "a number is wanted"),
+    ("study: table7\nsettings:\n  kp_nm_s_rad: fast\n", 3, "must be a number"),
     ("study: table7\nsettings:\n  inertia_kg_m2: -1\n", 3, "greater than 0"),
     (GOOD.replace("[2, 2]]", "[2, 1]]"), 5, "not orthogonal"),
     (GOOD.replace("name: J", "name: Q"), 6, "no factor 'Q'"),
@@ -98,11 +98,11 @@ def test_set_goes_on_top_of_a_file(load):
 
 
 @pytest.mark.parametrize(("study", "assignment", "words"), [
-    ("table7", "Kp", "name=value is wanted"),
-    ("table7", "=3", "name=value is wanted"),
-    ("table7", "Kp=", "name=value is wanted"),
+    ("table7", "Kp", "must be name=value"),
+    ("table7", "=3", "must be name=value"),
+    ("table7", "Kp=", "must be name=value"),
     ("table7", "colour=3", "unknown key 'colour'"),
-    ("table7", "Kp=fast", "a number is wanted"),
+    ("table7", "Kp=fast", "must be a number"),
     ("table7", "Kp=.nan", "finite"),
     ("table7", "Kp=[1, 2", "--set Kp=[1, 2"),
     ("table7", "J=-5", "greater than 0"),

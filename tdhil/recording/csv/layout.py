@@ -187,7 +187,7 @@ def _choice(quantity: str, text: str, flag: str) -> ColumnChoice:
     unit = unit_of(quantity, spelt)
     if unit is None or not name:
         raise UsageError(
-            f"{shown(spelt)!r} is no unit of {quantity}; there are {', '.join(known_units(quantity))}",
+            f"{shown(spelt)!r} is not a unit of {quantity}; use {', '.join(known_units(quantity))}",
             where=flag, next_step="If the colon belongs to the column's name, write the unit behind another colon",
             entry=MessageCode.CSV_COLUMNS_UNCLEAR,
         )
@@ -432,8 +432,8 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
         odd = odd or split_name(name)[1]
     if odd:
         raise CsvMisnamed(
-            f"{shown(odd)!r} is no known unit of {quantity}, in column {shown(name)!r}; "
-            f"there are {', '.join(known_units(quantity))}",
+            f"{shown(odd)!r}, of column {shown(name)!r}, is not a unit of {quantity}; "
+            f"use {', '.join(known_units(quantity))}",
             where=where, next_step=f"{next_step}, with the column's unit, or convert the column",
         )
     if below is not None and named is not None and below != named:
