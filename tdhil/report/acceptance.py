@@ -102,7 +102,8 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
             AcceptanceVerdict.FAIL if apart else AcceptanceVerdict.CANNOT_TELL)
         other = _other_scope(expected.name, document)
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
-        seen = f"identified {value:.5g} ({printed_interval(low, high, 5)}){other}"
+        span = "" if low == high else f" ({printed_interval(low, high, 5)})"     # a setting of the run has none
+        seen = f"identified {value:.5g}{span}{other}"
     return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
                     value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
 

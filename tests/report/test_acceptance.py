@@ -119,6 +119,7 @@ def test_the_interval_decides_and_not_the_value():
     limit = {"torque-limit": (500.0, 10.0)}
     (told,) = judged(document(), limit)["off"]
     assert told.startswith("the torque limit of the run is 0.8 times the expected value")
+    assert judged(document(), limit)["quantities"][0]["text"].endswith("identified 400")      # a setting, not measured
     assert acceptance_of([], document()) is None
 
 

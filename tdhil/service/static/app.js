@@ -113,7 +113,7 @@
   /** Format a value with its interval: two digits of the half-width, as on the terminal's card. */
   function interval(value, low, high) {
     if (value === null || value === undefined) return null;
-    if (low === null || low === undefined || high === null || high === undefined) return number(value);
+    if (low === null || low === undefined || high === null || high === undefined || low === high) return number(value);
     const half = (high - low) / 2, places = half > 0 ? Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(half)))) : 4;
     // the ends are rounded outwards; 1e-6 of the last digit is the rounding of the arithmetic
     const step = 10 ** -places, down = Math.floor(low / step + 1e-6) * step, up = Math.ceil(high / step - 1e-6) * step;
