@@ -1,13 +1,14 @@
 """Count the figures of the shape of the source: lines, files, helpers called once, constants, long signatures.
 
     python benchmarks/shape.py                 # the counts
-    python benchmarks/shape.py --helpers       # private functions that are named once, with their lengths
+    python benchmarks/shape.py --helpers       # private functions that are called once, with their lengths
     python benchmarks/shape.py --parameters    # functions of more than seven parameters
     python benchmarks/shape.py --tree FOLDER   # of another checkout, to compare
 
-A helper is a private function or method whose name occurs once in the source apart from its definition. A parameter is
-counted but for ``self`` and ``cls``; fields of a dataclass are no parameters. A numeric constant is a module-level name
-that is bound to numbers only, as `tests/packaging/constants.py` reads them.
+A helper is a private function or method whose name occurs once in the source apart from its definition, in a call. One
+that stands as a value, in a table or as a callback, can't go inline and is not counted. A parameter is counted but for
+``self`` and ``cls``; fields of a dataclass are no parameters. A numeric constant is a module-level name that is bound
+to numbers only, as `tests/packaging/constants.py` reads them.
 """
 
 from __future__ import annotations
@@ -62,15 +63,16 @@ class Shape:
     lines: int
     functions: tuple[Function, ...]
     named: Counter[str]
+    called: frozenset[str]
     constants: int
     bare: int
 
     def helpers(self) -> list[Function]:
-        """Return the private functions that are named once."""
+        """Return the private functions that are named once, in a call."""
         defined = Counter(one.node.name for one in self.functions)
         return [one for one in self.functions
                 if one.private and defined[one.node.name] == 1 and self.named[one.node.name] == 1
-                and not one.node.decorator_list]
+                and one.node.name in self.called and not one.node.decorator_list]
 
     def long_signatures(self) -> list[Function]:
         """Return the functions of more than seven parameters."""
@@ -90,29 +92,41 @@ def names_in(tree: ast.AST) -> Iterator[str]:
             yield from (one.name for one in node.names)
 
 
+def called_in(tree: ast.AST) -> Iterator[str]:
+    """Yield the name of each function that is called."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            if isinstance(node.func, ast.Name):
+                yield node.func.id
+            elif isinstance(node.func, ast.Attribute):
+                yield node.func.attr
+
+
 def shape_of(root: Path) -> Shape:
     """Read the source below a checkout and count it."""
     paths = sorted(path for room in ROOMS for path in (root / room).rglob("*.py"))
     functions: list[Function] = []
     named: Counter[str] = Counter()
+    called: set[str] = set()
     lines = constants = bare = 0
     for path in paths:
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)
         lines += source.count("\n")
         named.update(names_in(tree))
+        called.update(called_in(tree))
         functions += [Function(path, node) for node in ast.walk(tree)
                       if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
         constants += sum(isinstance(node, ast.Assign | ast.AnnAssign) and numeric(node.value) for node in tree.body)
         bare += len(list(bare_constants(path)))
-    return Shape(len(paths), lines, tuple(functions), named, constants, bare)
+    return Shape(len(paths), lines, tuple(functions), named, frozenset(called), constants, bare)
 
 
 def main() -> int:
     """Print the counts of the source, or a list of what one of them counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--tree", type=Path, default=ROOT, help="another checkout")
-    parser.add_argument("--helpers", action="store_true", help="list the private functions that are named once")
+    parser.add_argument("--helpers", action="store_true", help="list the private functions that are called once")
     parser.add_argument("--parameters", action="store_true", help="list the functions of more than seven parameters")
     asked = parser.parse_args()
     found = shape_of(asked.tree.resolve())
@@ -125,7 +139,7 @@ def main() -> int:
     mean = sum(one.lines for one in found.functions) / len(found.functions)
     for name, value in (
         ("files", found.files), ("lines", found.lines), ("functions", len(found.functions)),
-        ("lines of a function, mean", round(mean, 1)), ("private functions named once", len(found.helpers())),
+        ("lines of a function, mean", round(mean, 1)), ("private functions called once", len(found.helpers())),
         ("numeric constants of a module", found.constants), ("of these without a word", found.bare),
         ("functions of more than seven parameters", len(found.long_signatures())),
     ):
