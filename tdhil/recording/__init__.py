@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
-        FRAME_CHANNELS as FRAME_CHANNELS, LiveInertia as LiveInertia, RAW_FRAMES as RAW_FRAMES, SAMPLE as SAMPLE,
-        VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
+        FRAME_CHANNELS as FRAME_CHANNELS, LiveInertia as LiveInertia, RAW_FRAMES as RAW_FRAMES, REHEARSAL as REHEARSAL,
+        SAMPLE as SAMPLE, VIRTUAL_COLUMNS as VIRTUAL_COLUMNS, VIRTUAL_STRING as VIRTUAL_STRING,
         schema_name as schema_name,
     )
     from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run
@@ -51,7 +51,7 @@ else:
             "read_reference TraceSurvey motion_of column_mistakes survey_trace units_of"
         ),
         "log_audit": "LogAudit audit_log messages_of texts_of_message",
-        "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES SAMPLE "
+        "log_format": "CAN CHANNELS CLASSES COMMAND EXCITATION FRAME_CHANNELS LiveInertia RAW_FRAMES REHEARSAL SAMPLE "
                       "VIRTUAL_COLUMNS VIRTUAL_STRING schema_name",
         "log_reader": "read_cycles read_frames read_run",
         "log_tail": "LogChunks LoggedMessage LogNews LogTail messages_in",

@@ -42,6 +42,10 @@ from tdhil.recording.recording import Excitation, Level, Ramp, Segment, Stage
 # Event: something in a run that deserves a line, such as an error, a warning, a lost sample, or a key press.
 
 
+REHEARSAL: Final = "FAULT REHEARSAL"
+"""Mark of a run of the simulated drive with scripted faults (`--fault`). Its result does not count for the rig."""
+
+
 RECOVERED: Final = "recovered"
 """Kind of the event in a recovered copy: the file is complete, but the run in it is not."""
 
@@ -105,7 +109,8 @@ class LiveInertia:
 _LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 _INFO, _WARNING, _ERROR = 2, 3, 4
 _WARNINGS: Final = frozenset({
-    INTERRUPTED, RECOVERED, "bus", "clock", "dropped", "fault", "left", "limits", "stop", "warning", "watchdog",
+    INTERRUPTED, RECOVERED, REHEARSAL, "bus", "clock", "dropped", "fault", "left", "limits", "stop", "warning",
+    "watchdog",
 })
 _NAME: Final = "tdhil"
 

@@ -22,6 +22,7 @@ from tdhil.recording.log_format import (
     FRF,
     FRF_COLUMNS,
     LIVE_INERTIA,
+    LOG,
     MODES,
     RESULT,
     STAGE,
@@ -127,6 +128,12 @@ class Cold(NamedTuple):
     time_s: float | None
     payload: bytes
     flush: bool
+
+
+def rehearsal_mark(faults: Sequence[Any]) -> Cold:
+    """Return a line of /log with the mark of a rehearsal, as text. Its final message has the log's time in it."""
+    text = f"{', '.join(map(str, faults))}. The drive is simulated. The history of the rig does not include this run"
+    return Cold(LOG, None, text.encode(), flush=False)
 
 
 def stage_message(stage: Stage) -> Cold:

@@ -22,7 +22,18 @@ from typing import Any, Final, Self
 from drivers import Command, RawFrame, Sample
 from tdhil.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.recording import log_messages
-from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE, Event, LiveInertia, log_payload
+from tdhil.recording.log_format import (
+    CAN,
+    CLASSES,
+    COMMAND,
+    EVENT,
+    LOG,
+    REHEARSAL,
+    SAMPLE,
+    Event,
+    LiveInertia,
+    log_payload,
+)
 from tdhil.recording.log_messages import Cold, event_message, pack_command, pack_frames, pack_sample
 from tdhil.recording.mcap_container import Container, LogGone, RawFile
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
@@ -267,6 +278,8 @@ class Pump:
     def _put_cold(self, cold: Cold) -> None:
         channel, time_s, payload, flush = cold
         log_ns = self._log_ns(self._time_s if time_s is None else time_s)
+        if channel == LOG:
+            payload = log_payload(REHEARSAL, payload.decode(), log_ns)
         self._container.add(channel, log_ns, payload)
         if channel == EVENT:
             self._put_log(log_ns, payload)
@@ -346,7 +359,7 @@ class RunWriter:
         frames: int = CAN,
     ) -> None:
         self.path = path
-        self._raised = self._closing = False
+        self._raised = self._closing = self._marked = False
         self._checked_s = 0.0
         self._backlog = Backlog(queue_size or (STEPPED_QUEUE if block else REAL_TIME_QUEUE), block=block)
         try:
@@ -419,6 +432,9 @@ class RunWriter:
     def configuration(self, run: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
         """Log the run's configuration and `RecordingBuilder.facts`; the last call counts."""
         self._rare(log_messages.configuration_message(run, facts))
+        if (faults := run.get("faults")) and not self._marked:
+            self._rare(log_messages.rehearsal_mark(faults))
+            self._marked = True
 
     def result(self, result: Mapping[str, Any]) -> None:
         """Log the result document; the last call counts."""

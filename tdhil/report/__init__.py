@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     )
     from tdhil.report.console import PlainConsole as PlainConsole, stderr_console as stderr_console
     from tdhil.report.document import (
-        SIMULATED as SIMULATED, rehearsal_of as rehearsal_of, result_document as result_document,
-        run_facts as run_facts, text_of as text_of,
+        SIMULATED as SIMULATED, marks as marks, rehearsal_of as rehearsal_of, rehearsed_faults as rehearsed_faults,
+        result_document as result_document, run_facts as run_facts, text_of as text_of,
     )
     from tdhil.report.verification import (
         print_verification as print_verification, verification_document as verification_document,
@@ -81,7 +81,7 @@ else:
         "blocks": "Column Picture Report ReportSection Table Text reference_of shown_date",
         "card": "card_html card_text inertia_text minutes print_card rounded with_interval",
         "console": "PlainConsole stderr_console",
-        "document": "SIMULATED rehearsal_of result_document run_facts text_of",
+        "document": "SIMULATED marks rehearsal_of rehearsed_faults result_document run_facts text_of",
         "verification": "print_verification verification_document verification_report write_verification_report",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",

@@ -28,7 +28,7 @@ from tdhil.report.card import (
     rounded,
     sentence,
 )
-from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, text_of, uploaded_rows
+from tdhil.report.document import banner, coded_reason, coded_warnings, rehearsal_rows, text_of, uploaded_rows
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
@@ -144,17 +144,6 @@ class Report:
     letterhead: Letterhead = NO_LETTERHEAD
 
 
-def _simulated(document: Part) -> str:
-    if not (found := marks(document)):
-        return ""
-    said = ["drive and rig are simulated, no real shaft turned"] if document["simulated"] else []
-    if faults := ", ".join(document.get("rehearsed_faults") or ()):
-        said.append(f"rehearsed: {faults}. The history of the rig does not include this result")
-    if document.get("uploaded"):
-        said.append("tdhil serve did not make this recording. It was uploaded, and no history of a rig includes it")
-    return f"{found}: {'; '.join(said)}"
-
-
 def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
     """Return the report of a result; ``sha256`` is that of its log."""
     rig = document["rig"] or {}
@@ -162,7 +151,7 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
     return Report(
         title="Moment of inertia at the motor shaft",
         subtitle=" · ".join(facts),
-        simulated=_simulated(document),
+        simulated=banner(document),
         answer=_answer(document),
         warnings=coded_warnings(document),
         sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),

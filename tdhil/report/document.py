@@ -11,15 +11,12 @@ from profiles import MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
 from tdhil.config import STATED, expectations_in
 from tdhil.estimation import Estimate, FrequencyResponse, Identification, InertiaEstimate, Options, with_total
-from tdhil.recording import Recording
+from tdhil.recording import REHEARSAL, Recording
 from tdhil.report.acceptance import acceptance_of
 from tdhil.report.inertia_scope import scope_of
 from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
-REHEARSAL = "FAULT REHEARSAL"
-"""Mark of a run of the simulated drive with scripted faults (`--fault`). Its result does not count for the rig."""
-
 UPLOADED = "UPLOADED"
 """Mark of a recording that was uploaded to the service, which did not make the run itself."""
 
@@ -82,6 +79,18 @@ def marks(document: Mapping[str, Any]) -> str:
     found += [REHEARSAL] if document["simulated"] and document.get("rehearsed_faults") else []
     found += [UPLOADED] if document.get("uploaded") else []
     return " · ".join(found)
+
+
+def banner(document: Mapping[str, Any]) -> str:
+    """Return the marks of a report with their meaning, '' without a mark."""
+    if not (found := marks(document)):
+        return ""
+    said = ["drive and rig are simulated, no real shaft turned"] if document["simulated"] else []
+    if faults := ", ".join(document.get("rehearsed_faults") or ()):
+        said.append(f"rehearsed: {faults}. The history of the rig does not include this result")
+    if document.get("uploaded"):
+        said.append("tdhil serve did not make this recording. It was uploaded, and no history of a rig includes it")
+    return f"{found}: {'; '.join(said)}"
 
 
 def speed_loop_present_of(run: Mapping[str, Any]) -> dict[str, Any] | None:

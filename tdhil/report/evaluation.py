@@ -24,7 +24,7 @@ from tdhil.report.blocks import (
     shown_date,
 )
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED, rehearsal_rows, run_facts
+from tdhil.report.document import banner, marks, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
@@ -79,7 +79,7 @@ def evaluation_document(
 
 def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None:
     """Print measured beside predicted values, in 80 columns."""
-    simulated = f" · {SIMULATED}" if document["simulated"] else ""
+    simulated = f" · {marks(document)}" if document["simulated"] else ""
     name = document["string"] or "a virtual string"
     where = "in the drive's own loop, " if document["controller"]["own_loop"] else ""
     console.print(Words(f"{document['controller']['kind']} controller, {where}on {name}{simulated}", style="bold"))
@@ -180,7 +180,7 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
     return Report(
         title="Speed controller on a virtual drill string",
         subtitle=" · ".join(fact for fact in facts if fact),
-        simulated=f"{SIMULATED}: drive and rig are simulated, no real shaft turned" if document["simulated"] else "",
+        simulated=banner(document),
         answer=_answer(document),
         warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
         sections=tuple(sections),

@@ -25,7 +25,7 @@ from tdhil.report.blocks import (
     shown_date,
 )
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED, only_finite, rehearsal_rows, run_facts
+from tdhil.report.document import banner, marks, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET
@@ -82,7 +82,7 @@ def verification_document(
 
 def print_verification(document: Part, console: PlainConsole) -> None:
     """Print measured beside predicted. 80 columns do."""
-    simulated = f" · {SIMULATED}" if document["simulated"] else ""
+    simulated = f" · {marks(document)}" if document["simulated"] else ""
     console.print(Words(f"speed loop of the drive, verified by steps{simulated}", style="bold"))
     verdict = document["verdict"]
     head = ("verdict", Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
@@ -161,7 +161,7 @@ def verification_report(document: Part, sha256: str = "") -> Report:
     return Report(
         title="Speed loop of the drive, verified",
         subtitle=" · ".join(fact for fact in facts if fact),
-        simulated=f"{SIMULATED}: drive and rig are simulated, no real shaft turned" if document["simulated"] else "",
+        simulated=banner(document),
         answer=AnswerBox(_COLOURS.get(verdict, "red"), verdict.replace("_", " ").capitalize(), (),
                          _VERDICTS[verdict], f"{document['reason']}.", document["next_step"]),
         warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),

@@ -53,6 +53,21 @@ def test_events_are_a_log_that_viewers_know(tmp_path):
     assert [event.kind for event in read_run(path).events] == ["plan", "failure", "bus"]      # once, by us
 
 
+def test_a_rehearsal_is_marked_once_for_viewers(tmp_path):
+    path = tmp_path / "run.mcap"
+    run = {"faults": ["sto@hold+2s", "spike=3"]}
+    with RunWriter(path, epoch_ns=EPOCH_NS, block=True) as writer:
+        writer.configuration({"faults": []}, {})
+        writer.configuration(run, {})
+        writer.event(Event(2.0, "plan", "a plan"))
+        writer.configuration(run, {})
+    first, second = [(one.level, one.message, log_time) for _, log_time, one in decoded(path, "/log")]
+    assert first == (3, "FAULT REHEARSAL: sto@hold+2s, spike=3. The drive is simulated. The history of the rig does not"
+                     " include this run", EPOCH_NS)
+    assert second[1] == "plan: a plan"
+    assert [event.kind for event in read_run(path).events] == ["plan"]
+
+
 def test_the_frequency_response_is_arrays_that_viewers_plot(tmp_path):
     path = tmp_path / "run.mcap"
 
