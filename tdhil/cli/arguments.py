@@ -87,10 +87,12 @@ def hide_rare(*actions: argparse.Action) -> None:
     _RARE.update(actions)
 
 
-def add_archived(parser: argparse._ActionsContainer) -> None:
-    """Add the option that includes runs which `tdhil serve` has archived."""
+def add_left_out(parser: argparse._ActionsContainer) -> None:
+    """Add the options that include runs which are left out by default."""
     parser.add_argument("--archived", action="store_true",
                         help="include runs that tdhil serve has archived (default: they are left out)")
+    parser.add_argument("--rehearsals", action="store_true",
+                        help="include rehearsals: runs with --fault (default: they are left out)")
 
 
 def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:

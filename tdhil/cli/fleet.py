@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
-from tdhil.cli.arguments import add_archived, add_option, add_settings, amount, settings_in
+from tdhil.cli.arguments import add_left_out, add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
@@ -57,7 +57,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
                         help="memory limit for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
-    add_archived(parser)
+    add_left_out(parser)
     add_option(parser, OPTION["json"], help="the summary as one JSON document on stdout")
 
 
@@ -129,13 +129,12 @@ def _stamp(log: str) -> tuple[int, int]:
 
 
 def _print_row(row: FleetRow, as_json: bool) -> None:
-    from tdhil.report import SIMULATED, PlainConsole
+    from tdhil.report import PlainConsole
 
     if as_json:
         sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
     else:
-        simulated = f"{SIMULATED} " if row.simulated else ""
-        PlainConsole().print(f"{simulated}{row.log}: {_result_text(row)}", soft_wrap=True)
+        PlainConsole().print(f"{_log_text(row)}: {_result_text(row)}", soft_wrap=True)
     sys.stdout.flush()
 
 
@@ -159,6 +158,7 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
         limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),
         cache=not namespace.no_cache, again=getattr(namespace, "again", False),
         retry_failed=getattr(namespace, "retry_failed", False), archived=namespace.archived,
+        rehearsals=namespace.rehearsals,
     )
 
 
@@ -207,6 +207,7 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
         print_json(summary.document())
         return
     from tdhil.fleet import counted
+    from tdhil.recording import REHEARSAL
     from tdhil.report import SIMULATED, PlainConsole
 
     console = PlainConsole()
@@ -219,10 +220,11 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
         why = "interrupted: " if summary.interrupted else ""
         console.print(f"{why}{summary.left} remaining; run the same command again")
     console.print(_counts(found))
-    if found["simulated"]:
-        console.print(f"{found['simulated']} of them {SIMULATED}", style="magenta")
+    for count, mark in ((found["simulated"], SIMULATED), (found["rehearsed"], REHEARSAL)):
+        if count:
+            console.print(f"{count} of them {mark}", style="magenta")
     _list(console, "results", [
-        f"{f'{SIMULATED} ' if row.simulated else ''}{row.log}: {_result_text(row)}"
+        f"{_log_text(row)}: {_result_text(row)}"
         for row in summary.rows if row.inertia_kg_m2 is not None])
     _list(console, "failed", [f"{one['log']}: {one['text']}" for one in found["failures"]])
     _list(console, "from a part of the run", [f"{one['log']}: {one['text']}" for one in found["in_part"]])
@@ -234,6 +236,8 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
         console.print(f"skipped: {summary.live} being written")
     if summary.archived:
         console.print(f"left out: {counted(summary.archived, 'archived run')}; --archived includes them")
+    if summary.rehearsals:
+        console.print(f"left out: {counted(summary.rehearsals, 'rehearsal')} of faults; --rehearsals includes them")
     if summary.bare_traces:
         console.print(f"skipped: {counted(summary.bare_traces, 'CSV file')} without a .yaml of the same name")
 
@@ -261,6 +265,13 @@ def _list(console: Any, title: str, lines: list[str]) -> None:
 
 def _was(verdict: str, inertia_kg_m2: float | None) -> str:
     return verdict if inertia_kg_m2 is None else f"{verdict} {inertia_kg_m2:.5g} kg·m²"
+
+
+def _log_text(row: FleetRow) -> str:
+    """Return the name of the log after its marks."""
+    from tdhil.report import marks
+
+    return f"{marks(vars(row))} {row.log}".lstrip()
 
 
 def _result_text(row: FleetRow) -> str:

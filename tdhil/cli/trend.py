@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.arguments import add_archived, add_option, add_settings, settings_in
+from tdhil.cli.arguments import add_left_out, add_option, add_settings, settings_in
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
@@ -42,7 +42,7 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_output(parser: argparse.ArgumentParser, stated: str) -> None:
-    add_archived(parser)
+    add_left_out(parser)
     add_option(parser, OPTION["json"])
     add_report_option(parser, "report")
     add_head_options(parser, stated)
@@ -58,10 +58,11 @@ def run(namespace: argparse.Namespace) -> int:
     if rows and not kept:
         raise UsageError("every run of this table is archived", where=str(namespace.table),
                          next_step="Add --archived", entry=MessageCode.LOG_NEEDED)
-    document = trend_document(kept, namespace.rig)
+    document = trend_document(kept, namespace.rig, rehearsals=namespace.rehearsals)
     if left := len(rows) - len(kept):
-        text = f"{counted(left, 'archived run')} left out; --archived includes them"
-        document = {**document, "notes": [*document["notes"], text]}
+        document["notes"].append(f"{counted(left, 'archived run')} left out; --archived includes them")
+    if not namespace.rehearsals and any(row.rehearsed_faults and row.rig == document["rig"] for row in kept):
+        document["notes"].append("--rehearsals includes the rehearsals")
     if namespace.json:
         print_json(document)
     else:
@@ -88,7 +89,12 @@ def run_compare(namespace: argparse.Namespace) -> int:
                              next_step="Add --archived, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)
     settings = FleetSettings(**settings_in(namespace))
     report = ReportFile.of_files(namespace, *namespace.logs)
-    runs = [identified(log, settings) for log in namespace.logs]
+    runs = []
+    for log in namespace.logs:
+        runs.append(identified(log, settings))
+        if not namespace.rehearsals and (faults := runs[-1].row.rehearsed_faults):
+            raise UsageError(f"this run is a rehearsal of faults: {faults}", where=str(log),
+                             next_step="Add --rehearsals, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)
     document = compare_document(runs)
     if namespace.json:
         print_json(document)
@@ -110,7 +116,7 @@ def _print_trend(document: Mapping[str, Any]) -> None:
     console = PlainConsole()
     stand = "stands" if document["results"] == 1 else "stand"
     results, logs = counted(document["results"], "result"), counted(document["logs"], "log")
-    console.print(f"rig {document['rig']}{_simulated(document)}: {results} that {stand}, of {logs}", soft_wrap=True)
+    console.print(f"rig {document['rig']}{_marks(document)}: {results} that {stand}, of {logs}", soft_wrap=True)
     for one in document["quantities"]:
         console.print(_followed_text(one), soft_wrap=True)
     for note in document["notes"]:
@@ -131,7 +137,7 @@ def _print_compared(document: Mapping[str, Any]) -> None:
 
     console = PlainConsole()
     if document["simulated"]:
-        console.print(_simulated(document).strip(" ·"), style="magenta")
+        console.print(_marks(document).strip(" ·"), style="magenta")
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     table.add_column("setting")
@@ -153,11 +159,11 @@ def _print_compared(document: Mapping[str, Any]) -> None:
             console.print("  " + ", ".join(rest), soft_wrap=True)
 
 
-def _simulated(document: Mapping[str, Any]) -> str:
-    """Return the suffix of a title if any of the runs is simulated."""
-    from tdhil.report import SIMULATED
+def _marks(document: Mapping[str, Any]) -> str:
+    """Return the suffix of a title if any of the runs is simulated or a rehearsal."""
+    from tdhil.report import marks
 
-    return f" · {SIMULATED}" if document["simulated"] else ""
+    return f" · {marks(document)}" if document["simulated"] else ""
 
 
 def _headings(logs: Sequence[str]) -> Sequence[str]:
@@ -195,8 +201,8 @@ def _trend_report(document: Mapping[str, Any]) -> Report:
     from tdhil.report import Picture, ReportSection, Text
 
     caption = "Each result with its 95 % coverage interval; a vertical line marks a change."
-    if any(point["in_part"] is not None for one in document["quantities"] for point in one["points"]):
-        caption += " Hollow: a result from a part of the run."
+    if document["rehearsed_faults"]:
+        caption += " Hollow: a rehearsal of faults on the simulated drive."
     lines = (*(_followed_text(one) for one in document["quantities"]), *document["notes"])
     picture = Picture("trend", partial(_draw_trend, document=document), 7.5, caption)
     return _report(f"{document['rig']} over time", document, (
@@ -218,10 +224,12 @@ def _compare_report(document: Mapping[str, Any]) -> Report:
 
 
 def _report(title: str, document: Mapping[str, Any], sections: tuple[ReportSection, ...]) -> Report:
-    from tdhil.report import SIMULATED, Report
+    from tdhil.report import Report, marks
     from tdhil.version import __version__
 
-    said = f"{SIMULATED}: at least one drive and rig is simulated" if document["simulated"] else ""
+    said = f"{marks(document)}: at least one drive and rig is simulated" if document["simulated"] else ""
+    if faults := ", ".join(document["rehearsed_faults"]):
+        said += f"; rehearsed: {faults}"
     return Report(title=title, subtitle="", simulated=said, answer=None, warnings=(),
                   sections=tuple(one for one in sections if one.blocks), footer=f"tdhil {__version__}")
 
@@ -231,8 +239,8 @@ def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
     shown = [one for one in document["quantities"] if one["points"]]
     axes: Any = figure.subplots(max(1, len(shown)), 1, squeeze=False, sharex=True)[:, 0]
     for one, axis in zip(shown, axes, strict=False):
-        for in_part, face in ((False, _COLOURS[0]), (True, "white")):
-            points = [point for point in one["points"] if (point["in_part"] is not None) is in_part]
+        for rehearsed, face in ((False, _COLOURS[0]), (True, "white")):
+            points = [point for point in one["points"] if (point["rehearsed_faults"] is not None) is rehearsed]
             axis.errorbar(
                 [_moment(point["date"]) for point in points], [point["value"] for point in points],
                 fmt="o", ms=3.5, lw=1, color=_COLOURS[0], mfc=face,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
     from tdhil.fleet.trend import (
         Compared as Compared, compare_document as compare_document, identified as identified,
-        trend_document as trend_document,
+        rehearsals_left_out as rehearsals_left_out, trend_document as trend_document,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
@@ -31,5 +31,5 @@ else:
         "rows": "FleetRow FleetSettings counted row_of",
         "table": "load_duckdb read_table",
         "task": "Done LogTask identify_log",
-        "trend": "Compared compare_document identified trend_document",
+        "trend": "Compared compare_document identified rehearsals_left_out trend_document",
     })

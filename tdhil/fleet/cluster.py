@@ -128,11 +128,9 @@ def _done(distributed: Any, client: Any, futures: list[Any], stop: Callable[[], 
             return list(distributed.wait(futures, timeout=wait_s, return_when="FIRST_COMPLETED").done)
         empty_s = 0.0 if client.scheduler_info()["workers"] else empty_s + wait_s
         if empty_s >= _PATIENCE_S:
-            raise TdhilError(
-                f"the cluster has had no worker for {empty_s:.0f} s; finished results are kept", where="fleet",
-                next_step="Start workers, and the same command again",
-                entry=MessageCode.WORKER_PROCESS_LOST,
-            )
+            raise TdhilError(f"the cluster has had no worker for {empty_s:.0f} s; finished results are kept",
+                             where="fleet", next_step="Start workers, and the same command again",
+                             entry=MessageCode.WORKER_PROCESS_LOST)
     return []
 
 

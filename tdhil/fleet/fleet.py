@@ -20,7 +20,6 @@ from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, named_er
 from tdhil.process_pool import Loss, Pool, TaskLimits
 
 _SLOWEST: Final = 5
-_GOOD: Final = ("valid", "valid_wide")
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class FleetRequest:
 
     ``scheduler``: address of a Dask cluster to use instead. ``cache``: keep recordings that were read beside the table;
     ``again``: identify all logs anew; ``retry_failed``: identify the failed ones anew. ``archived``: include runs that
-    `tdhil serve` has archived.
+    `tdhil serve` has archived; ``rehearsals``: include rehearsals of faults on the simulated drive.
     """
 
     roots: tuple[str, ...]
@@ -43,6 +42,7 @@ class FleetRequest:
     again: bool = False
     retry_failed: bool = False
     archived: bool = True
+    rehearsals: bool = False
 
     @property
     def folder(self) -> Path:
@@ -54,7 +54,7 @@ class FleetRequest:
 class FleetSummary:
     """Result of a fleet, rows by log. ``done_before``: number of rows that existed before; ``live``: of logs that are
     being written; ``bare_traces``: of CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: number
-    of logs still to do; ``archived``: of archived runs that were left out.
+    of logs still to do; ``archived``, ``rehearsals``: of archived runs and of rehearsals that were left out.
     """
 
     rows: tuple[FleetRow, ...]
@@ -67,6 +67,7 @@ class FleetSummary:
     wall_s: float = 0.0
     left: int = 0
     archived: int = 0
+    rehearsals: int = 0
     interrupted: bool = False
 
     def document(self) -> dict[str, Any]:
@@ -80,6 +81,7 @@ class FleetSummary:
             "failures": [{"log": row.log, "kind": row.error_kind, "text": row.error_text}
                          for row in self.rows if row.failed],
             "simulated": sum(row.simulated is True for row in self.rows),
+            "rehearsed": sum(row.rehearsed_faults is not None for row in self.rows),
             "in_part": [
                 {"log": row.log, "aborted_stage": row.aborted_stage, "aborted_by": row.aborted_by,
                  "complete": row.complete, "text": row.part_text}
@@ -92,8 +94,7 @@ class FleetSummary:
             ],
             "slowest": [{"log": log, "cpu_s": cpu_s} for log, cpu_s in self.slowest],
             "done_before": self.done_before, "live": self.live, "bare_traces": self.bare_traces, "left": self.left,
-            "archived": self.archived,
-            "cpu_s": self.cpu_s, "wall_s": self.wall_s,
+            "archived": self.archived, "rehearsals": self.rehearsals, "cpu_s": self.cpu_s, "wall_s": self.wall_s,
         }
 
     @property
@@ -118,12 +119,6 @@ class Progress(Protocol):
         """Count one finished log."""
 
 
-class _Silent:
-    def start(self, total: int, done: int) -> None: ...
-
-    def done(self, row: FleetRow) -> None: ...
-
-
 def run_fleet(
     request: FleetRequest,
     progress: Progress | None = None,
@@ -145,11 +140,11 @@ def run_fleet(
         raise UsageError("no log is there", where=", ".join(request.roots),
                          next_step="Logs end in .mcap; a trace in .csv needs a .yaml of the same name beside it",
                          entry=MessageCode.NO_LOGS_FOUND)
-    progress = progress or _Silent()
     with Journal(request.folder) as journal, ExitStack() as stack:
         rows, todo = _known(request, journal, found.logs)
         before = len(rows)
-        progress.start(len(found.logs), before)
+        if progress is not None:
+            progress.start(len(found.logs), before)
         taken: list[tuple[float, str]] = []
         interrupted = False
         try:
@@ -162,19 +157,20 @@ def run_fleet(
                 journal.add(row, key, stamps[task.log])
                 rows[task.log] = row
                 taken.append((done.cpu_s, task.log))
-                progress.done(row)
+                if progress is not None:
+                    progress.done(row)
             interrupted = stop is not None and stop() and len(rows) < len(found.logs)
         except KeyboardInterrupt:
             interrupted = True
             stack.close()
-        ordered = tuple(rows[log] for log in sorted(rows))
+        ordered = tuple(row for _, row in sorted(rows.items()) if request.rehearsals or row.rehearsed_faults is None)
         write_table(ordered, request.out)
-    taken.sort(reverse=True)
+    shown = {row.log for row in ordered}
     return FleetSummary(
         rows=ordered, out=request.out, done_before=before, live=len(found.live), bare_traces=len(found.bare_traces),
-        archived=len(found.archived),
-        slowest=tuple((log, cpu_s) for cpu_s, log in taken[:_SLOWEST]), cpu_s=sum(cpu_s for cpu_s, _ in taken),
-        wall_s=time.monotonic() - began, left=len(found.logs) - len(rows),
+        archived=len(found.archived), rehearsals=len(rows) - len(ordered),
+        slowest=tuple((log, cpu_s) for cpu_s, log in sorted(taken, reverse=True) if log in shown)[:_SLOWEST],
+        cpu_s=sum(cpu_s for cpu_s, _ in taken), wall_s=time.monotonic() - began, left=len(found.logs) - len(rows),
         interrupted=interrupted,
     )
 

@@ -173,8 +173,7 @@ def load_duckdb(where: str = "--out", otherwise: str = "end it in .csv or .sqlit
         python = shlex.quote(sys.executable or "python")
         raise UsageError("Parquet needs duckdb, not installed here", where=where,
                          next_step=f"Install: {python} -m pip install 'duckdb>=1.1,<2'; or {otherwise}",
-                         entry=MessageCode.PACKAGE_MISSING,
-                         ) from error
+                         entry=MessageCode.PACKAGE_MISSING) from error
 
 
 def _write_parquet(rows: list[dict[str, Any]], path: Path) -> None:

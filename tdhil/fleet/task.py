@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -75,7 +75,8 @@ def _text(error: Exception) -> str:
     return f"internal error, please report it with this log: {error}"
 
 
-def _row(task: LogTask, path: Path, facts: Mapping[str, Any]) -> tuple[FleetRow, bool]:
+def _row(task: LogTask, path: Path, facts: dict[str, Any]) -> tuple[FleetRow, bool]:
+    from tdhil.report import rehearsed_faults
     from tdhil.session import conclude
 
     kept = None if task.cache is None else Path(task.cache) / f"{facts['sha256']}.v{_CACHE_FORMAT}.npz"
@@ -86,6 +87,8 @@ def _row(task: LogTask, path: Path, facts: Mapping[str, Any]) -> tuple[FleetRow,
         if kept is not None:
             _into_cache(kept, record)
     record = replace(record, log=task.log)
+    if faults := rehearsed_faults(record.configuration):
+        facts["rehearsed_faults"] = ", ".join(faults)          # also in the row of a log without a result
     record.require_motion()
     configuration = record.asked(task.settings.asked())
     found = conclude(record.recording, configuration, task.log, record.assumed)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
 from profiles.quantities import printed_ends, printed_interval
-from tdhil.config import OPTION
 from tdhil.errors import UsageError
 from tdhil.fleet.change_detection import LEAST, Difference, History, Measured, difference, history
 from tdhil.fleet.rows import FleetRow, FleetSettings, counted, row_of
-from tdhil.fleet.task import content_hash, read_any
 
 _GOOD: Final = ("valid", "valid_wide")
 _SHOWN: Final = 5       # number of logs that a note names
@@ -74,11 +73,35 @@ def scale_of(row: FleetRow) -> str | None:
     return drive if drive is None or row.torque_calibration is None else f"{drive} calibrated {row.torque_calibration}"
 
 
-def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str, Any]:
+def history_rows(rows: Sequence[FleetRow], *, rehearsals: bool = False) -> tuple[list[FleetRow], list[str]]:
+    """Return the rows that count in the history of their rig, and how many are left out, in words.
+
+    This is the one rule of `tdhil trend` and of the service. Left out are: rehearsals, unless ``rehearsals``; logs
+    without a valid result; results from a part of a run. What ended a run early, such as a fault, may have begun within
+    its data. The operator may have stopped it because of what the data show. Such results differ by selection, and the
+    intervals do not cover that.
+    """
+    real = [row for row in rows if rehearsals or row.rehearsed_faults is None]
+    standing = [row for row in real if row.verdict in _GOOD]
+    rehearsed, without = len(rows) - len(real), len(real) - len(standing)
+    parts = [f"{row.log}: {row.part_text}" for row in standing if row.part_text is not None]
+    shown = ", ".join(parts[:_SHOWN]) + (f", and {len(parts) - _SHOWN} more" if len(parts) > _SHOWN else "")
+    return [row for row in standing if row.part_text is None], [text for count, text in (
+        (rehearsed, rehearsals_left_out(rehearsed)),
+        (without, f"{without} of {counted(len(real), 'log')} without a result that stands: left out"),
+        (len(parts), f"{counted(len(parts), 'result')} from a part of the run ({shown}): left out")) if count]
+
+
+def rehearsals_left_out(count: int) -> str:
+    """Return the note on this number of rehearsals."""
+    return f"{counted(count, 'rehearsal')} of faults on the simulated drive: left out"
+
+
+def trend_document(rows: Sequence[FleetRow], rig: str | None = None, *, rehearsals: bool = False) -> dict[str, Any]:
     """Return a rig's results over time, as ``tdhil trend --json`` prints them. Raises UsageError for an unknown rig.
 
-    None: the one rig in the table; with several rigs a UsageError lists them. Only valid results count. The torque
-    scale cancels in differences of one drive.
+    None: the one rig in the table; with several rigs a UsageError lists them. `history_rows` states which rows count.
+    The torque scale cancels in differences of one drive.
     """
     known = sorted({row.rig for row in rows if row.rig is not None})
     if rig is None and len(known) == 1:
@@ -90,23 +113,11 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
         raise UsageError(what if known else "no log is of a rig that has a name", where="--rig",
                          next_step=f"There are: {shown}" if known else "No log in the table names its rig: `name:` in "
                          "rig.yaml does, or `rig:` in the .yaml beside a trace")
-    real = [row for row in mine if row.rehearsed_faults is None]
-    standing = [row for row in real if row.verdict in _GOOD]
-    dated = sorted(((_time_s(row), row) for row in standing if _time_s(row) is not None),
-                   key=lambda one: (one[0], one[1].log))
-    kept = [(float(time_s or 0.0), row) for time_s, row in dated]
-    notes = []
-    if len(mine) > len(real):
-        notes.append(f"{counted(len(mine) - len(real), 'rehearsal')} of faults on the simulated drive: left out")
-    if len(real) > len(standing):
-        without = len(real) - len(standing)
-        notes.append(f"{without} of {counted(len(real), 'log')} without a result that stands: left out")
+    standing, notes = history_rows(mine, rehearsals=rehearsals)
+    kept = sorted(((time_s, row) for row in standing if (time_s := _time_s(row)) is not None),
+                  key=lambda one: (one[0], one[1].log))
     if len(standing) > len(kept):
         notes.append(f"{counted(len(standing) - len(kept), 'log')} without a date: left out")
-    if in_part := [row for _, row in kept if row.part_text is not None]:
-        shown = ", ".join(f"{row.log}: {row.part_text}" for row in in_part[:_SHOWN])
-        more = f", and {len(in_part) - _SHOWN} more" if len(in_part) > _SHOWN else ""
-        notes.append(f"{len(in_part)} of {counted(len(kept), 'result')} from a part of the run only ({shown}{more})")
     if len({row.simulated for _, row in kept}) > 1:
         notes.append("simulated runs and real ones are mixed")
     drives = {drive_of(row) for _, row in kept}
@@ -132,9 +143,14 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
         notes.append("the drive reports no serial number: runs on this rig are taken for runs on one drive")
     return {
         "rig": rig, "logs": len(mine), "results": len(kept), "notes": notes,
-        "simulated": any(row.simulated for _, row in kept),
+        "simulated": any(row.simulated for _, row in kept), "rehearsed_faults": _faults(row for _, row in kept),
         "quantities": [_followed(quantity, kept) for quantity in QUANTITIES],
     }
+
+
+def _faults(rows: Iterable[FleetRow]) -> list[str]:
+    """Return the rehearsed faults of these rows, each once."""
+    return list(dict.fromkeys(row.rehearsed_faults for row in rows if row.rehearsed_faults is not None))
 
 
 def _scope_text(scope: str | None) -> str:
@@ -155,8 +171,7 @@ def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dic
     document: dict[str, Any] = {
         "name": quantity.name, "column": quantity.column, "unit": quantity.unit,
         "points": [{"log": row.log, "date": row.date, "value": one.value, "low": one.low, "high": one.high,
-                    "in_part": row.part_text}
-                   for row, one in points],
+                    "rehearsed_faults": row.rehearsed_faults} for row, one in points],
         "probability": None, "changes": [], "drift": None,
     }
     if len(points) < LEAST:
@@ -215,13 +230,9 @@ def _signed(text: str) -> str:
 
 
 def _time_s(row: FleetRow) -> float | None:
-    if row.date is None:
-        return None
-    try:
-        found = datetime.fromisoformat(row.date)
-    except ValueError:
-        return None
-    return found.timestamp()
+    with suppress(ValueError):
+        return None if row.date is None else datetime.fromisoformat(row.date).timestamp()
+    return None
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -239,6 +250,7 @@ class Compared:
 
 def identified(log: Path, settings: FleetSettings) -> Compared:
     """Identify one log for a comparison. Raises TdhilError."""
+    from tdhil.fleet.task import content_hash, read_any
     from tdhil.session import conclude
 
     record = read_any(log)
@@ -249,9 +261,8 @@ def identified(log: Path, settings: FleetSettings) -> Compared:
     return Compared(row, found, _settings(row, found, record.recording, record.configuration))
 
 
-def _settings(
-    row: FleetRow, document: Mapping[str, Any], recording: Any, run: Mapping[str, Any]
-) -> dict[str, str]:
+def _settings(row: FleetRow, document: Mapping[str, Any], recording: Any, run: Mapping[str, Any]) -> dict[str, str]:
+    from tdhil.config import OPTION
     from tdhil.report import shown_date
 
     rig = document.get("rig") or {}
@@ -302,7 +313,7 @@ def compare_document(runs: Sequence[Compared]) -> dict[str, Any]:
     first, *others = runs
     return {
         "logs": [run.row.log for run in runs],
-        "simulated": any(run.row.simulated for run in runs),
+        "simulated": any(run.row.simulated for run in runs), "rehearsed_faults": _faults(run.row for run in runs),
         "results": [asdict(run.row) for run in runs],
         "settings": [
             {"name": name, "values": [run.settings[name] for run in runs],

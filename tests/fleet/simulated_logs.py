@@ -36,9 +36,11 @@ def rig_plants(count: int) -> list[CoveragePlant]:
 
 def write_log(
     path: Path, recording: Recording, rig: str, number: int, result: dict[str, object] | None = None,
-    aborted_by: str | None = None,
+    aborted_by: str | None = None, faults: tuple[str, ...] = (),
 ) -> None:
-    """The recording as a finished log of rig ``rig``, a run each week; ``aborted_by``: the kind of error that did."""
+    """The recording as a finished log of rig ``rig``, a run each week; ``aborted_by``: the kind of error that did;
+    ``faults``: rehearsed in the run.
+    """
     epoch_ns = int((BEGAN + timedelta(weeks=number)).timestamp() * 1e9)
     run = {
         "tdhil": "0.1.0", "drive": "canopen", "embedded_simulator": True, "bench": {"name": rig, "load": "none"},
@@ -46,6 +48,8 @@ def write_log(
         "profile": {"name": "generic/cia402", "title": "CiA 402"},
         "started": (BEGAN + timedelta(weeks=number)).isoformat(), "identify": {"tolerance": 0.05, "confidence": 0.95},
     }
+    if faults:
+        run["faults"] = list(faults)
     if aborted_by is not None:
         run["ended"] = {"kind": aborted_by, "what": "it ended", "exit_code": 6, "time_s": float(recording.time_s[-1])}
     whole = asdict(recording)
