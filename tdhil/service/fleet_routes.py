@@ -45,7 +45,8 @@ async def ask_fleet(site: Site, request: Request, body: FleetBody) -> FleetView:
     """Identify the logs of a folder again."""
     settings = settings_of(body)
     who = principal(request).name
-    found = await off(lambda: site.fleets.ask(body.folder, body.below, settings, who, archived=body.archived))
+    found = await off(lambda: site.fleets.ask(body.folder, body.below, settings, who, archived=body.archived,
+                                              rehearsals=body.rehearsals))
     site.supervisor.note(who, "fleet asked", None, "", folder=body.folder, below=body.below, fleet=found.id, **settings)
     return found
 

@@ -45,7 +45,8 @@ LOOK_S: Final = 0.3
 class FleetView:
     """State of a fleet request. ``held``: it waits until no shaft turns; ``left_s``: estimated remaining time, s.
 
-    ``summary`` is the document of `tdhil fleet --json`. ``archived``: the service's archived runs are included.
+    ``summary`` is the document of `tdhil fleet --json`. ``archived``: the service's archived runs are included;
+    ``rehearsals``: those of faults are included.
     """
 
     id: str
@@ -63,6 +64,7 @@ class FleetView:
     summary: dict[str, Any] | None = None
     error: Told | None = None
     archived: bool = False
+    rehearsals: bool = False
 
 
 @dataclass
@@ -103,14 +105,13 @@ class Fleets:
             raise NotThere("this fleet does not exist", where=f"fleet {fleet[:40]}", next_step="See the list of fleets")
         return found
 
-    def ask(
-        self, folder: str, below: str, settings: Mapping[str, Any], who: str, *, archived: bool = False,
-    ) -> FleetView:
-        """Start a request, or continue an earlier one. Raises UsageError, and Conflict while another request runs."""
+    def ask(self, folder: str, below: str, settings: Mapping[str, Any], who: str, **included: bool) -> FleetView:
+        """Start a request, or continue an earlier one. ``included``: as in `FleetView`. Raises UsageError, and Conflict
+        while another request runs.
+        """
         self._check(folder, below)
-        plain: dict[str, Any] = {"folder": folder, "below": below, "settings": dict(settings)}
-        if archived:
-            plain["archived"] = True
+        more: dict[str, Any] = {name: True for name, given in included.items() if given}
+        plain: dict[str, Any] = {"folder": folder, "below": below, "settings": dict(settings), **more}
         fleet = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
         place = self._places / fleet
         with self._lock:
@@ -128,7 +129,7 @@ class Fleets:
                 [sys.executable, "-m", "tdhil.service.fleets", str(place)], stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE, start_new_session=True,
             )
-            view = FleetView(fleet, folder, below, dict(settings), asked, who, "running", archived=archived)
+            view = FleetView(fleet, folder, below, dict(settings), asked, who, "running", **more)
             self._going = going = _Going(view, process, began_s=time.monotonic())
         for work in (self._listen, self._gate):
             threading.Thread(target=work, args=(going,), daemon=True).start()
@@ -241,7 +242,8 @@ class Fleets:
             with suppress(ValueError, KeyError, TypeError):
                 found = json.loads(line)
                 if "row" in found:
-                    going.rows.append(found["row"])
+                    if going.view.rehearsals or found["row"]["rehearsed_faults"] is None:
+                        going.rows.append(found["row"])
                     failed = going.view.failed + (found["row"]["error_kind"] is not None)
                     with self._lock:
                         going.view = replace(going.view, done=going.view.done + 1, failed=failed)
@@ -327,7 +329,8 @@ def main(folder: Path) -> int:
         if request["folder"] == RUNS:
             roots = _own_logs(Store(Path()), archived=bool(request.get("archived")))
         summary = run_fleet(
-            FleetRequest(roots, folder / TABLE, FleetSettings(**request["settings"]), jobs=usable_cores()), teller)
+            FleetRequest(roots, folder / TABLE, FleetSettings(**request["settings"]), jobs=usable_cores(),
+                         rehearsals=bool(request.get("rehearsals"))), teller)
         found = summary.document() | {"out": TABLE}
         whole = not summary.interrupted and not summary.left
         teller.say(state="done" if whole else "interrupted", total=len(summary.rows) + summary.left,

@@ -23,6 +23,7 @@ from tdhil.recording import (
     CHANNELS,
     COMMAND,
     RAW_FRAMES,
+    REHEARSAL,
     SAMPLE,
     VIRTUAL_STRING,
     LogChunks,
@@ -53,6 +54,7 @@ class Running:
     run: str
     log: Path
     simulated: bool
+    rehearsal: bool = False
 
 
 @dataclass
@@ -131,9 +133,10 @@ class Relay:
     async def _introduce(self, running: Running | None) -> None:
         """Send name and channels. Each run is a new session, so that a viewer starts anew with each run."""
         simulated = " SIMULATED" if (self.simulated if running is None else running.simulated) else ""
-        run = None if running is None else running.run
-        metadata = {"rig": self.rig, "run": run or "", "simulated": str(bool(simulated)).lower()}
-        await self._say({"op": "serverInfo", "name": f"tdhil, rig {self.rig}{simulated}", "capabilities": [],
+        run, rehearsal = (None, "") if running is None else (running.run, f" {REHEARSAL}" * running.rehearsal)
+        metadata = {"rig": self.rig, "run": run or "", "simulated": str(bool(simulated)).lower(),
+                    "rehearsal": str(bool(rehearsal)).lower()}
+        await self._say({"op": "serverInfo", "name": f"tdhil, rig {self.rig}{simulated}{rehearsal}", "capabilities": [],
                          "metadata": metadata, "sessionId": run or "no run"})
         await self._say({"op": "advertise", "channels": _channels()})
         if running is None:

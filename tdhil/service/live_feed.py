@@ -41,7 +41,7 @@ class LivePicture:
         self.stages: list[dict[str, Any]] = []
         self.inertias: list[dict[str, Any]] = []
         self.limits: dict[str, float | None] | None = None
-        self.simulated: bool | None = None
+        self.rehearsed_faults: list[str] = []
         self.stepped = False
         self.epoch_ns = 0
         self.last_s: float | None = None
@@ -72,6 +72,8 @@ class LivePicture:
         if news.configuration is not None:
             run = news.configuration.get("run", {})
             self.stepped = run.get("stepped") is True
+            if (faults := [str(one) for one in run.get("faults") or ()]) != self.rehearsed_faults:
+                self.rehearsed_faults = shown["rehearsed_faults"] = faults
             limits = (run.get("bench") or {}).get("limits")
             if isinstance(limits, dict) and limits != self.limits:
                 self.limits = shown["limits"] = limits
@@ -80,7 +82,7 @@ class LivePicture:
     def whole(self) -> dict[str, Any]:
         """Return all data so far, for a new viewer."""
         return {"samples": columns(self.samples), "events": self.events, "stages": self.stages,
-                "inertias": self.inertias, "limits": self.limits}
+                "inertias": self.inertias, "limits": self.limits, "rehearsed_faults": self.rehearsed_faults}
 
     def age_s(self, wall_s: float, mono_s: float) -> float | None:
         """Return the age of the latest sample, s; in stepped time, which runs ahead, the time since its arrival."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from tdhil.service.run_state import State, now
 
 if TYPE_CHECKING:
-    from tdhil.service.store import Summary
+    from tdhil.service.run_filter import Summary
 
 EVERY_S: Final = 1.0
 """Polling interval, s."""

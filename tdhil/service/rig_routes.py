@@ -10,7 +10,7 @@ from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import apis
-from tdhil.service.run_routes import archived_too
+from tdhil.service.run_routes import asks_for
 from tdhil.service.run_state import Conflict, NotAllowed
 from tdhil.service.schemas import (
     CalibrationBody,
@@ -25,7 +25,6 @@ from tdhil.service.schemas import (
     StoppedView,
     TrendView,
 )
-from tdhil.service.site import TREND_RUNS
 from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 
 if TYPE_CHECKING:
@@ -104,30 +103,14 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
 async def trend(site: Site, request: Request, body: None) -> TrendView:
     """Return how the results of a rig changed over time."""
     which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
-
-    archived = archived_too(request)
-    found = await off(lambda: site.trend_rows(which.id, archived=archived))
-    notes = await off(lambda: _left_out(site, which.id, archived=archived))
+    archived, rehearsals = asks_for(request, "archived"), asks_for(request, "rehearsals")
+    found = await off(lambda: site.trend_rows(which.id, archived=archived, rehearsals=rehearsals))
+    notes = await off(lambda: site.left_out(which.id, archived=archived, rehearsals=rehearsals))
     if not found:
         nothing = {"rig": which.id, "logs": 0, "results": 0, "quantities": []}
         return TrendView(which.id, {**nothing, "notes": ["no run has a result yet", *notes]})
     document = await site.work("trend", None, {"rows": found, "rig": which.id})
     return TrendView(which.id, {**document, "notes": [*document["notes"], *notes]} if notes else document)
-
-
-def _left_out(site: Site, rig: str, *, archived: bool) -> list[str]:
-    """Return which results of a rig its history leaves out, in words.
-
-    A run that ended early has an interval of its own data. But its end, such as a fault, may have begun within these
-    data, and the operator may have stopped the run because something was wrong. So it is left out.
-    """
-    from tdhil.fleet import counted
-
-    runs = site.list_runs(rig, None, TREND_RUNS, archived=archived)
-    uploaded = sum(one.uploaded for one in runs)
-    early = sum(one.inertia_kg_m2 is not None and one.state != "done" and not one.rehearsal for one in runs)
-    notes = [f"{counted(uploaded, 'uploaded recording')}: left out"] if uploaded else []
-    return [*notes, f"{counted(early, 'run')} with J that ended early: left out"] if early else notes
 
 
 async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
@@ -147,7 +130,7 @@ async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int
     await off(check)
     asked = await off(lambda: site.supervisor.start_run(which, body, who.name, key, address_of(request)))
     if asked.new:
-        site.metrics.runs_asked.inc()
+        (site.metrics.rehearsals_asked if asked.request.rehearsal else site.metrics.runs_asked).inc()
     return 201 if asked.new else 200, await off(lambda: site.run_view(asked.request.id))
 
 

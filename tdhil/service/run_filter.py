@@ -4,28 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
+
+from tdhil.config import STATED
 
 
-class Row(Protocol):
-    """Row of a list of runs, as far as a filter uses it (`tdhil.service.store.Summary`)."""
+@dataclass(frozen=True)
+class Summary:
+    """A row of the list of runs."""
+
+    id: str
+    rig: str
+    state: str
+    asked: str
+    asked_by: str
+    ended: str | None = None
+    simulated: bool = True
+    verdict: str | None = None
+    inertia_kg_m2: float | None = None
+    low_kg_m2: float | None = None         # coverage interval to quote, with the torque scale's uncertainty
+    high_kg_m2: float | None = None
+    repeatability_rel: float | None = None
+    exit_code: int | None = None
+    rehearsal: bool = False                # whether a fault of the simulated drive was rehearsed
+    uploaded: bool = False                 # whether the recording was uploaded: no history of a rig
+    operator: str | None = None            # as edited later, else as recorded; `note` too
+    note: str | None = None
+    tags: tuple[str, ...] = ()
+    archived: bool = False
+    customer: str | None = None
+    order_number: str | None = None
+    place: str | None = None
+
+    def contains(self, text: str) -> bool:
+        """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
+        said = self.searched
+        return all(word in said for word in text.casefold().split())
 
     @property
-    def id(self) -> str: ...
-    @property
-    def rig(self) -> str: ...
-    @property
-    def state(self) -> str: ...
-    @property
-    def verdict(self) -> str | None: ...
-    @property
-    def tags(self) -> tuple[str, ...]: ...
-    @property
-    def archived(self) -> bool: ...
-    def contains(self, text: str) -> bool: ...
+    def searched(self) -> str:
+        """Return the text in which a search looks, in lower case."""
+        kept = {**self.__dict__, "tags": ", ".join(self.tags)}
+        return " ".join(str(kept[name] or "") for name in SEARCHED).casefold()
 
 
-T = TypeVar("T", bound=Row)
+SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", *STATED, "tags")
+"""Columns of `Summary` in which a search finds text."""
+
+
+T = TypeVar("T", bound=Summary)
 SEARCHED_COLUMN: Final = "searched"
 """Column of the index with the text of a row in lower case, so that a search calls no function for each row."""
 SORTS: Final = {
@@ -37,7 +64,7 @@ SORTS: Final = {
 
 @dataclass(frozen=True)
 class RunFilter:
-    """Conditions on the runs of a list. None: any. ``archived``: archived runs, too.
+    """Conditions on the runs of a list. None: any. ``archived``: archived runs, too. ``answered``: only with J.
 
     ``tag``: one whole tag. ``text``: words for `Summary.contains`. ``until``: no run with a later id, so that a page of
     a list has the same runs when new ones come.
@@ -50,21 +77,27 @@ class RunFilter:
     text: str = ""
     archived: bool = False
     until: str | None = None
+    answered: bool = False
+    rehearsal: bool | None = None
+    uploaded: bool | None = None
 
-    def contains(self, one: Row) -> bool:
+    def contains(self, one: Summary) -> bool:
         """Return whether a row meets the conditions."""
         return (
             self.rig in (None, one.rig) and self.state in (None, one.state) and self.verdict in (None, one.verdict)
             and (self.tag is None or self.tag in one.tags) and one.contains(self.text)
             and (self.archived or not one.archived) and (self.until is None or one.id <= self.until)
+            and (one.inertia_kg_m2 is not None or not self.answered)
+            and self.rehearsal in (None, one.rehearsal) and self.uploaded in (None, one.uploaded)
         )
 
-    def sql(self, without: Iterable[str] = ()) -> tuple[str, list[str]]:
+    def sql(self, without: Iterable[str] = ()) -> tuple[str, list[str | bool]]:
         """Return the conditions as SQL, with its values. ``without``: ids of runs that are left out."""
-        where = [] if self.archived else ["not archived"]
-        values: list[str] = []
+        where = ([] if self.archived else ["not archived"]) + ["inertia_kg_m2 is not null"] * self.answered
+        values: list[str | bool] = []
         for text, value in (
             ("rig = ?", self.rig), ("state = ?", self.state), ("verdict = ?", self.verdict),
+            ("rehearsal = ?", self.rehearsal), ("uploaded = ?", self.uploaded),
             ("instr(', ' || tags || ', ', ', ' || ? || ', ')", self.tag), ("id <= ?", self.until),
             *((f"instr({SEARCHED_COLUMN}, ?)", word.casefold()) for word in self.text.split()),
             *(("id <> ?", one) for one in without),

@@ -17,7 +17,7 @@ from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
 from tdhil.service.middleware import error_view, off, whole_number
 from tdhil.service.routing import apis
-from tdhil.service.run_filter import NEWEST, SORTS, Order, RunFilter
+from tdhil.service.run_filter import NEWEST, SORTS, Order, RunFilter, Summary
 from tdhil.service.run_state import NotThere, State, now
 from tdhil.service.schemas import (
     AcceptanceView,
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from starlette.routing import Route
 
     from tdhil.service.site import Site
-    from tdhil.service.store import Summary
 
 LONGEST_SEARCH: Final = 200
 """Longest text of a search, characters."""
@@ -96,14 +95,14 @@ def _filter(request: Request) -> RunFilter:
             raise UsageError(f"must be at most {LONGEST_SEARCH} characters", where=name,
                              entry=MessageCode.REQUEST_WRONG)
     return RunFilter(query.get("rig"), state, query.get("verdict"), query.get("tag"), query.get("text", ""),
-                     archived_too(request), query.get("until"))
+                     asks_for(request, "archived"), query.get("until"))
 
 
-def archived_too(request: Request) -> bool:
-    """Return whether the request asks for archived runs, too. Raises UsageError."""
-    text = request.query_params.get("archived", "false")
+def asks_for(request: Request, what: str) -> bool:
+    """Return whether the request asks for ``archived`` runs, or ``rehearsals``, too. Raises UsageError."""
+    text = request.query_params.get(what, "false")
     if text not in ("true", "false"):
-        raise UsageError("must be true or false", where="archived", entry=MessageCode.REQUEST_WRONG)
+        raise UsageError("must be true or false", where=what, entry=MessageCode.REQUEST_WRONG)
     return bool(text == "true")
 
 
@@ -113,13 +112,16 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
     if not 2 <= len(set(which)) == len(which) <= 8:
         raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID",
                          entry=MessageCode.REQUEST_WRONG)
-    archived = archived_too(request)
+    archived, rehearsals = asks_for(request, "archived"), asks_for(request, "rehearsals")
     for one in which:
         if not (await off(partial(site.store.place, one)) / "run.mcap").is_file():
             raise NotThere("this run has no log", where=f"run {one}")
         if not archived and (await off(partial(site.store.annotations, one))).archived:
             raise UsageError("this run is archived", where=f"run {one}", next_step="Add archived=true, or leave it out",
                              entry=MessageCode.REQUEST_WRONG)
+        if not rehearsals and await off(partial(site.store.rehearsed, one)):
+            raise UsageError("this run is a rehearsal of faults", where=f"run {one}",
+                             next_step="Add rehearsals=true, or leave it out", entry=MessageCode.REQUEST_WRONG)
     asked = {"runs": which, "runs_folder": str(site.store.runs)}
     return CompareView(which, await off(partial(_asked_at, site, which, await site.work("compare", None, asked))))
 

@@ -20,10 +20,9 @@ from tdhil.service.audit import Broken, Entry
 from tdhil.service.evidence_request import STATEMENT, EvidenceView
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
-from tdhil.service.run_filter import SORTS
+from tdhil.service.run_filter import SORTS, Summary
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.start_request import TAKEN, option_schema
-from tdhil.service.store import Summary
 from tdhil.service.upload_request import ACCEPTED
 from tdhil.service.uploads import Upload
 from tdhil.version import __version__
@@ -627,7 +626,7 @@ class FleetBody(Body):
     """Logs to identify again, and settings; None: the setting of each run.
 
     ``folder``: a name from `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside it.
-    ``archived``: whether the service's own runs include the archived ones.
+    ``archived``: whether the service's own runs include the archived ones; ``rehearsals``: include those of faults.
     """
 
     folder: str = ""
@@ -636,6 +635,7 @@ class FleetBody(Body):
     tolerance: float | str | None = None
     confidence: float | str | None = None
     archived: bool = False
+    rehearsals: bool = False
 
 
 @dataclass(frozen=True)
@@ -677,6 +677,7 @@ class Route:
 
 
 _ARCHIVED: Final = {"archived": "true: archived runs too"}
+_LEFT_OUT: Final = {**_ARCHIVED, "rehearsals": "true: rehearsals of faults too"}
 _RUN_FILTER: Final = {
     "rig": "runs of this rig only", "state": "runs in this state only", "verdict": "runs with this verdict only",
     "tag": "runs with this tag only",
@@ -705,7 +706,7 @@ ROUTES: Final = (
     Route("POST", "/rigs/{rig}/file", "edit_rig", "Change a rig's file (not the drive's address)",
           "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),
     Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
-          {200: TrendView}, errors=(404, 422), query=_ARCHIVED),
+          {200: TrendView}, errors=(404, 422), query=_LEFT_OUT),
     Route("POST", "/rigs/{rig}/calibration", "calibration", "Calibrate the torque by two runs; nothing is connected,"
           " and nothing is stored", "operator", {200: CalibrationView}, CalibrationBody, (403, 404, 422)),
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected", "viewer", {200: PlanView},
@@ -725,7 +726,7 @@ ROUTES: Final = (
           query={**_RUN_FILTER, "sort": f"{', '.join(SORTS)} (id)", "order": "desc or asc (desc)",
                  "page": "number of the page (1)"}),
     Route("GET", "/runs/compare", "compare", "Compare runs", "viewer", {200: CompareView}, errors=(404, 422),
-          query={"runs": "two to eight runs, separated by commas", **_ARCHIVED}),
+          query={"runs": "two to eight runs, separated by commas", **_LEFT_OUT}),
     Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
     Route("POST", "/runs/{run}/confirm", "confirm", "Confirm motion with the code shown at the rig", "operator",
           {200: RunView}, ConfirmBody, (403, 404, 409, 422)),

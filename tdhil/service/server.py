@@ -170,6 +170,7 @@ def serve(
     from tdhil.service.mail import Mail
     from tdhil.service.mqtt import Broker, Publisher
     from tdhil.service.notifications import RUNS, Notifier, Receiver
+    from tdhil.service.run_filter import RunFilter
     from tdhil.service.start_request import Rigs
     from tdhil.service.store import Index, Store
     from tdhil.service.supervisor import Supervisor
@@ -204,7 +205,7 @@ def serve(
     say("A stop over HTTP is no emergency stop: keep the hard-wired stop within reach. Ctrl-C stops all runs.")
     if publisher is not None:
         publisher.start()
-    notifiers = [Notifier(one.at(site), lambda: web.list_runs(None, None, RUNS), web.trends_around, say)
+    notifiers = [Notifier(one.at(site), lambda: web.find_runs(RunFilter(), limit=RUNS), web.trends_around, say)
                  for one in messages]
     for notifier in notifiers:
         notifier.start()

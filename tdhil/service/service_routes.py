@@ -80,7 +80,9 @@ async def health(site: Site, request: Request, body: None) -> HealthView:
 async def metrics(site: Site, request: Request, body: None) -> Response:
     """Return the metrics in the text format of Prometheus."""
     found = site.metrics
-    found.live.set(len(site.supervisor.live()))
+    rehearsed = await off(lambda: [site.store.rehearsed(run) for run in site.supervisor.live()])
+    found.live.set(rehearsed.count(False))
+    found.rehearsed.set(rehearsed.count(True))
     found.viewers.set(site.feeds.viewers)
     found.relayed.set(site.relays)
     views = await off(lambda: [site.rig_view(rig) for rig in site.supervisor.rigs.all()])

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -31,11 +31,11 @@ from tdhil.service.limits import UPLOAD_LIMIT
 from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
 from tdhil.service.run_channel import lives
-from tdhil.service.run_filter import NEWEST, Order, RunFilter
-from tdhil.service.run_state import NotThere, Status
+from tdhil.service.run_filter import NEWEST, Order, RunFilter, Summary
+from tdhil.service.run_state import NotThere, State, Status
 from tdhil.service.schemas import ReplayView, RigView, RunsPageView, RunView, adapter
 from tdhil.service.start_request import RigFile
-from tdhil.service.store import Summary, read_json
+from tdhil.service.store import read_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.uploads import TRACE, Uploads
 from tdhil.session import Holder
@@ -67,9 +67,13 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
-        self.runs_asked = Counter("tdhil_runs_asked", "Runs that were requested", registry=self.registry)
+        self.runs_asked = Counter("tdhil_runs_asked", "Runs that were requested, without rehearsals",
+                                  registry=self.registry)
+        self.rehearsals_asked = Counter("tdhil_rehearsals_asked", "Rehearsals of faults that were requested",
+                                        registry=self.registry)
         self.stops_asked = Counter("tdhil_stops_asked", "Stops that were requested", registry=self.registry)
-        self.live = Gauge("tdhil_runs_live", "Runs that have not ended", registry=self.registry)
+        self.live = Gauge("tdhil_runs_live", "Runs that have not ended, without rehearsals", registry=self.registry)
+        self.rehearsed = Gauge("tdhil_rehearsals_live", "Rehearsals that have not ended", registry=self.registry)
         self.viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=self.registry)
         self.relayed = Gauge("tdhil_foxglove_viewers", "Viewers that are sent a log as it grows",
                              registry=self.registry)
@@ -182,31 +186,20 @@ class Site:
         holder = self.supervisor.holder(rig)
         state: Literal["free", "busy", "held", "blocked"]
         state = "busy" if run else "held" if holder else "blocked" if blocked else "free"
-        last = self.list_runs(rig.id, None, 10)
+        last = self.find_runs(RunFilter(rig.id, answered=True, rehearsal=False, uploaded=False), limit=1)
         from tdhil.config import simulated_default_rig
 
         bench = simulated_default_rig(rig.rig) if simulated else rig.rig
         limits = None if bench.limits is None else bench.limits.model_dump()
         return RigView(
             rig.id, rig.name, state, simulated, rig.motion, problem, None if holder is None else str(holder), run,
-            blocked, drive, profile, limits,
-            next((one for one in last if one.inertia_kg_m2 is not None and not (one.rehearsal or one.uploaded)),
-                 None),
+            blocked, drive, profile, limits, next(iter(last), None),
         )
-
-    def list_runs(
-        self, rig: str | None, state: str | None, limit: int, text: str = "", *, archived: bool = False,
-    ) -> list[Summary]:
-        """Return runs from the index; from the files if the index is missing or out of date, as for a live run.
-
-        Archived runs are included only with ``archived``.
-        """
-        return self.find_runs(RunFilter(rig, state, text=text, archived=archived), limit=limit)
 
     def find_runs(
         self, wanted: RunFilter, order: Order = NEWEST, *, limit: int = 100, offset: int = 0,
     ) -> list[Summary]:
-        """Return a part of the runs that meet the conditions, as `list_runs`."""
+        """Return runs from the index; from the files if the index is missing or out of date, as for a live run."""
         return self._find_runs(self._ahead_of_the_index(), wanted, order, limit=limit, offset=offset)
 
     def _find_runs(
@@ -225,13 +218,10 @@ class Site:
     def runs_page(self, wanted: RunFilter, order: Order, page: int) -> RunsPageView:
         """Return a page of the list of runs, with the number of all that meet the conditions, and the choices."""
         live = self._ahead_of_the_index()
-        ahead = [one for one in live.values() if wanted.contains(one)]
-        index = self.supervisor.index
+        total = self._count_runs(live, wanted)
         try:
-            total = index.count(wanted, live) + len(ahead)
-            choices = index.choices()
+            choices = self.supervisor.index.choices()
         except (sqlite3.Error, OSError):
-            total = len(ahead) + sum(wanted.contains(one) for one in self.store.summaries() if one.id not in live)
             choices = {"rig": set(), "verdict": set(), "tags": set()}
         found = self._find_runs(live, wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS)
         newest = wanted.until or next(
@@ -241,6 +231,13 @@ class Site:
             found, total, page, max(1, -(-total // PAGE_RUNS)), (page - 1) * PAGE_RUNS + 1 if found else 0, newest,
             sorted(rigs), sorted(choices["verdict"]), sorted(choices["tags"], key=str.casefold))
 
+    def _count_runs(self, live: Mapping[str, Summary], wanted: RunFilter) -> int:
+        ahead = sum(wanted.contains(one) for one in live.values())
+        try:
+            return ahead + self.supervisor.index.count(wanted, live)
+        except (sqlite3.Error, OSError):
+            return ahead + sum(wanted.contains(one) for one in self.store.summaries() if one.id not in live)
+
     def _ahead_of_the_index(self) -> dict[str, Summary]:
         """Return the rows of the runs whose index entry is missing or out of date, from the files."""
         found = {}
@@ -249,16 +246,33 @@ class Site:
                 found[run] = self.store.summary(run)
         return found
 
-    def trend_rows(self, rig: str, *, archived: bool = False) -> list[dict[str, Any]]:
+    def trend_rows(self, rig: str, *, archived: bool = False, rehearsals: bool = False) -> list[dict[str, Any]]:
         """Return the rows of a rig's history, each with the time of the run's request, as on every page.
 
-        An uploaded recording has no row, since its identity is only stated by a person. Archived runs are included only
-        with ``archived``.
+        `tdhil.fleet.history_rows` states which of them count. An uploaded recording has no row, since its identity is
+        only stated by a person. A run that did not end as requested is a part of a run, also if it wrote no row.
         """
         self.supervisor.index.wait_until_made(WHOLE_INDEX_S)
-        runs = self.list_runs(rig, "done", TREND_RUNS, archived=archived)
-        return [{**row, "date": _local(one.asked)} for one in runs
-                if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
+        found, rehearsal = [], None if rehearsals else False
+        wanted = RunFilter(rig, archived=archived, answered=True, rehearsal=rehearsal, uploaded=False)
+        for one in self.find_runs(wanted, limit=TREND_RUNS):
+            row = read_json(self.store.place(one.id) / "row.json")
+            if one.state != State.DONE:
+                row = {"log": one.id, "verdict": one.verdict, "rig": rig, "aborted_by": one.state, **(row or {})}
+            if row is not None:
+                found.append({**row, "date": _local(one.asked)})
+        return found
+
+    def left_out(self, rig: str, *, archived: bool, rehearsals: bool) -> list[str]:
+        """Return which runs with J have no row in the rig's history, in words."""
+        from tdhil.fleet import counted, rehearsals_left_out
+
+        wanted, live = RunFilter(rig, archived=archived, answered=True), self._ahead_of_the_index()
+        notes = []
+        if uploaded := self._count_runs(live, replace(wanted, uploaded=True)):
+            notes.append(f"{counted(uploaded, 'uploaded recording')}: left out")
+        rehearsed = 0 if rehearsals else self._count_runs(live, replace(wanted, rehearsal=True, uploaded=False))
+        return [*notes, rehearsals_left_out(rehearsed)] if rehearsed else notes
 
     def trends_around(self, rig: str, run: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
         """Return the rig's trend without this run, and the trend with it."""
@@ -311,7 +325,8 @@ class Site:
             if view.run is not None:
                 with suppress(NotThere):
                     status = self.store.status(view.run)
-                    run = {"id": view.run, "state": status.state.value, "stage": status.stage, "since": status.at}
+                    run = {"id": view.run, "state": status.state.value, "stage": status.stage, "since": status.at,
+                           "rehearsal": self.store.rehearsed(view.run)}
             here = f"rigs/{quote(rig.id, safe='')}"
             found[f"{here}/state"] = {
                 "rig": rig.id, "name": view.name, "state": view.state, "simulated": view.simulated,

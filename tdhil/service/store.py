@@ -28,7 +28,7 @@ from tdhil.config import STATED
 from tdhil.errors import LogUnopened
 from tdhil.fleet import ANNOTATIONS_FILE
 from tdhil.service.annotations import Annotations
-from tdhil.service.run_filter import NEWEST, SEARCHED_COLUMN, Order, RunFilter
+from tdhil.service.run_filter import NEWEST, SEARCHED_COLUMN, Order, RunFilter, Summary
 from tdhil.service.run_state import NotThere, State, Status, now
 
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
@@ -131,49 +131,6 @@ class StoredRequest:
         return StoredRequest(**plain)
 
 
-@dataclass(frozen=True)
-class Summary:
-    """A row of the list of runs."""
-
-    id: str
-    rig: str
-    state: str
-    asked: str
-    asked_by: str
-    ended: str | None = None
-    simulated: bool = True
-    verdict: str | None = None
-    inertia_kg_m2: float | None = None
-    low_kg_m2: float | None = None         # coverage interval to quote, with the torque scale's uncertainty
-    high_kg_m2: float | None = None
-    repeatability_rel: float | None = None
-    exit_code: int | None = None
-    rehearsal: bool = False                # whether a fault of the simulated drive was rehearsed
-    uploaded: bool = False                 # whether the recording was uploaded: no history of a rig
-    operator: str | None = None            # as edited later, else as recorded; `note` too
-    note: str | None = None
-    tags: tuple[str, ...] = ()
-    archived: bool = False
-    customer: str | None = None
-    order_number: str | None = None
-    place: str | None = None
-
-    def contains(self, text: str) -> bool:
-        """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
-        said = self.searched
-        return all(word in said for word in text.casefold().split())
-
-    @property
-    def searched(self) -> str:
-        """Return the text in which a search looks, in lower case."""
-        kept = {**self.__dict__, "tags": ", ".join(self.tags)}
-        return " ".join(str(kept[name] or "") for name in SEARCHED).casefold()
-
-
-SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", *STATED, "tags")
-"""Columns of `Summary` in which a search finds text."""
-
-
 def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None,
                annotations: Annotations | None = None) -> Summary:
     """Return a run's row of the list from the contents of its files."""
@@ -261,6 +218,12 @@ class Store:
         except (TypeError, ValueError, KeyError):
             request = self.request(run)
             return Status.begun(run, request.rig, request.asked).to(State.INTERRUPTED, request.asked)
+
+    def rehearsed(self, run: str) -> bool:
+        """Return whether the run is a rehearsal; False without a request."""
+        with suppress(NotThere):
+            return self.request(run).rehearsal
+        return False
 
     def result(self, run: str) -> dict[str, Any] | None:
         return read_json(self.place(run) / "result.json")

@@ -256,4 +256,4 @@ class Web(Site):
             return None
         asked, status = self.store.request(run), self.store.status(run)
         simulated = asked.simulated if status.simulated is None else status.simulated
-        return Running(run, self.store.place(run) / "run.mcap", simulated)
+        return Running(run, self.store.place(run) / "run.mcap", simulated, asked.rehearsal)

@@ -127,7 +127,7 @@ def trend(asked: dict[str, Any]) -> dict[str, Any]:
     """Return the trend of a rig's runs."""
     from tdhil.fleet import FleetRow, trend_document
 
-    return {"document": trend_document([FleetRow(**one) for one in asked["rows"]], asked["rig"])}
+    return {"document": trend_document([FleetRow(**one) for one in asked["rows"]], asked["rig"], rehearsals=True)}
 
 
 def compare(asked: dict[str, Any]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from tdhil.config import STATED, form_options
 from tdhil.config.options import OPTION, OPTIONS, Form
 from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
+from tdhil.service.run_filter import RunFilter
 from tdhil.service.run_state import State
 from tdhil.service.schemas import API, ROUTES, SOCKETS, document
 from tests.service.conftest import HANGS_S, URL, Service, wait_for
@@ -270,6 +271,17 @@ def test_health_and_metrics(client, call, service):
     service.wait(run["id"], "moving")
     assert "tdhil_runs_live 1.0" in client.get("/metrics").text
     assert "tdhil_runs_asked_total 1.0" in call("GET", "/metrics", 200).text
+
+
+def test_rehearsals_are_counted_for_themselves_and_marked(client, call, service):
+    asked = {"note": "hold", "fault": ["sto@hold+2s"]}
+    run = call("POST", "/rigs/a/runs", 201, json=asked)["id"]
+    service.wait(run, "moving")
+    text = client.get("/metrics").text
+    assert "tdhil_runs_live 0.0" in text and "tdhil_runs_asked_total 0.0" in text
+    assert "tdhil_rehearsals_live 1.0" in text and "tdhil_rehearsals_asked_total 1.0" in text
+    assert call("GET", f"/runs/{run}", 200)["rehearsal"] and call("GET", "/runs", 200)[0]["rehearsal"]
+    assert service.web.broker_messages()["rigs/a/state"]["run"]["rehearsal"] is True
 
 
 # -- one run
@@ -640,7 +652,7 @@ def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypa
         base.execute("begin exclusive")
         call("POST", f"/runs/{run}/stop", 200)
         service.wait(run, "stopped")
-        assert service.web.list_runs(None, None, 10)[0].id == run      # from the files
+        assert service.web.find_runs(RunFilter())[0].id == run      # from the files
     base.close()
     wait_for("the index", lambda: service.index.find(state="stopped"))     # it is tried again
 
@@ -736,7 +748,7 @@ MOTION = {"mode", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "periods", 
     ("/start/real", {"tolerance", "max_time_s", "excitation", "expect", *STATED, *MOTION, "accept_unverified",
                      "accept_speed_unit", "reset_fault"}),
     ("/rehearse/a", {"stage", "after", "duration", "real_time"}),
-    ("/fleets", {"folder", "below", "archived", "tolerance", "model"}),
+    ("/fleets", {"folder", "below", "archived", "rehearsals", "tolerance", "model"}),
 ])
 def test_a_form_has_the_fields_of_the_table(client, path, fields):
     page = client.get(path)

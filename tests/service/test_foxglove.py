@@ -271,6 +271,20 @@ def test_the_next_run_is_a_session_of_its_own(bench, tmp_path):
     assert [topic for topic, *_ in bench.viewer.messages] == ["/event", "/result"] * 2
 
 
+def test_a_rehearsal_is_marked_in_the_name_and_in_the_metadata(bench, tmp_path):
+    write(tmp_path / "run.mcap")
+    bench.running = Running("one", tmp_path / "run.mcap", True, True)
+
+    async def played() -> None:
+        bench.running = Running("two", tmp_path / "run.mcap", True)
+        await bench.until(lambda: len([one for one in bench.viewer.told if one["op"] == "serverInfo"]) == 2)
+
+    bench.play(played)
+    first, second = [one for one in bench.viewer.told if one["op"] == "serverInfo"]
+    assert (first["name"], first["metadata"]["rehearsal"]) == ("tdhil, rig a SIMULATED FAULT REHEARSAL", "true")
+    assert (second["name"], second["metadata"]["rehearsal"]) == ("tdhil, rig a SIMULATED", "false")
+
+
 def test_a_run_that_died_is_let_go_of(bench, tmp_path):
     write(tmp_path / "whole.mcap")
     data = (tmp_path / "whole.mcap").read_bytes()

@@ -57,6 +57,15 @@ def test_its_age_is_the_clock_s_or_in_stepped_time_that_of_its_arrival():
     assert stepped.age_s(10**9 + 3.5, 7.0) == pytest.approx(2.0)
 
 
+def test_a_rehearsal_is_marked_for_every_viewer():
+    picture = LivePicture()
+    assert picture.whole()["rehearsed_faults"] == []
+    run = {"run": {"faults": ["sto@hold+2s"]}}
+    assert picture.take(news(0.0, 2, configuration=run), 0.0)["rehearsed_faults"] == ["sto@hold+2s"]
+    assert "rehearsed_faults" not in picture.take(news(1.0, 2, configuration=run), 1.0)
+    assert picture.whole()["rehearsed_faults"] == ["sto@hold+2s"]
+
+
 def test_what_is_no_number_is_none_in_json():
     picture = LivePicture()
     shown = picture.take(LogNews(np.array([[0.0, np.nan, np.inf]])), 0.0)

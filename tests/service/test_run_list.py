@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import itertools
 import random
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
+from tdhil.fleet import FleetRow
 from tdhil.service import site as site_module
-from tdhil.service.run_filter import SORTS, Order, RunFilter
+from tdhil.service.run_filter import SORTS, Order, RunFilter, Summary
 from tdhil.service.run_state import Status
-from tdhil.service.store import Index, Store, StoredRequest, Summary, summary_of
+from tdhil.service.store import Index, Store, StoredRequest, summary_of, write_json
 from tests.service.conftest import wait_for
 
 VERDICTS = (None, "valid", "valid_wide", "not_identifiable")
 FILTERS = (
     RunFilter(), RunFilter(archived=True), RunFilter(rig="b"), RunFilter(verdict="valid"), RunFilter(tag="bearing"),
     RunFilter(tag="bear"), RunFilter(text="anna 7"), RunFilter(rig="a", verdict="valid", tag="checked", text="RUN"),
-    RunFilter(state="failed", until="20260101-000020-000000"),
+    RunFilter(state="failed", until="20260101-000020-000000"), RunFilter(rehearsal=True), RunFilter(uploaded=False),
+    RunFilter(answered=True, rehearsal=False, uploaded=False), RunFilter(rehearsal=False, uploaded=True),
 )
 ORDERS = [Order(key, down) for key in SORTS for down in (True, False)]
 
@@ -34,6 +36,7 @@ def rows(count: int = 40) -> list[Summary]:
         value = draw.choice((None, 104.0, 99.5, 1000.0))
         found.append(replace(
             row, state=draw.choice(("done", "failed")), verdict=draw.choice(VERDICTS), inertia_kg_m2=value,
+            rehearsal=draw.random() < 0.3, uploaded=draw.random() < 0.3,
             operator=draw.choice((None, "anna", "Berta", "Ada")), note=f"run {number}", archived=draw.random() < 0.2,
             tags=tuple(draw.sample(("bearing", "checked", "Bear 2"), draw.randrange(3)))))
     return found
@@ -154,14 +157,56 @@ def test_the_plain_list_has_the_same_conditions(call, many):
         assert found == [one.id for one in many[::-1] if wanted.contains(one)]
 
 
-def test_a_history_says_which_results_of_runs_that_ended_early_it_leaves_out(call, service):
-    """They were left out in silence, though their pages show J."""
+def played(service, *runs: dict[str, object]) -> list[Summary]:
+    """Put runs of rig a with J into index and files, each with these values of its row."""
     service.index.rebuild()
-    kinds = (("done", False), ("stopped", False), ("failed", False), ("failed", True))
-    for one, (state, rehearsal) in zip(rows(4), kinds, strict=True):
+    found = [replace(one, **{"rig": "a", "state": "done", "verdict": "valid", "inertia_kg_m2": 104.0, "archived": False,
+                             "rehearsal": False, "uploaded": False, **values})
+             for one, values in zip(rows(len(runs)), runs, strict=True)]
+    for one in found:
         (service.store.runs / one.id).mkdir()
-        service.index.put(replace(one, rig="a", state=state, inertia_kg_m2=104.0, archived=False, rehearsal=rehearsal))
-    service.index.put(replace(rows(5)[4], rig="a", state="stopped", inertia_kg_m2=None))
+        service.index.put(one)
+    return found
+
+
+def test_a_history_says_which_results_of_runs_that_ended_early_it_leaves_out(call, service):
+    """By the rule of `tdhil trend`. They were left out in silence, though their pages show J."""
+    found = played(service, {"state": "done"}, {"state": "stopped"}, {"state": "failed"},
+                   {"state": "failed", "rehearsal": True}, {"state": "done", "uploaded": True},
+                   {"state": "stopped", "inertia_kg_m2": None})
     notes = call("GET", "/rigs/a/trend", 200)["trend"]["notes"]
-    assert "2 runs with J that ended early: left out" in notes
+    assert notes[:1] == [f"2 results from a part of the run ({found[2].id}: aborted (failed), {found[1].id}: aborted"
+                         " (stopped)): left out"]
+    assert notes[-2:] == ["1 uploaded recording: left out", "1 rehearsal of faults on the simulated drive: left out"]
     assert call("GET", "/rigs/b/trend", 200)["trend"]["notes"] == ["no run has a result yet"]
+
+
+def test_rehearsals_displace_no_result_of_a_history_and_are_there_if_asked_for(call, service, monkeypatch):
+    """A rig's latest thousand runs were its history, also where all of them were rehearsals."""
+    monkeypatch.setattr(site_module, "TREND_RUNS", 2)
+    first, *rehearsed = played(service, {}, *[{"rehearsal": True}] * 12)
+    faults = {"drive_name": "Inverter", "rehearsed_faults": "torque-scale=1.1"}
+    for one in (first, rehearsed[-1]):
+        row = FleetRow(one.id, "valid", rig="a", inertia_kg_m2=104.0, **({} if one is first else faults))
+        write_json(service.store.runs / one.id / "row.json", row.__dict__)
+    trend = call("GET", "/rigs/a/trend", 200)["trend"]
+    assert (trend["logs"], trend["results"], trend["rehearsed_faults"]) == (1, 1, [])
+    assert "12 rehearsals of faults on the simulated drive: left out" in trend["notes"]
+    trend = call("GET", "/rigs/a/trend?rehearsals=true", 200)["trend"]
+    assert (trend["logs"], trend["rehearsed_faults"]) == (1, ["torque-scale=1.1"])
+    assert not any("rehearsal" in one for one in trend["notes"])
+    call("GET", "/rigs/a/trend?rehearsals=perhaps", 422)
+    assert call("GET", "/rigs/a", 200)["last"]["id"] == first.id
+
+
+def test_a_rehearsal_is_compared_only_if_asked_for(call, service, monkeypatch):
+    one, rehearsed = played(service, {}, {"rehearsal": True})
+    for run, options in ((one.id, {}), (rehearsed.id, {"fault": ["sto@hold"]})):
+        request = StoredRequest(run, "a", "a.yaml", "0" * 64, options, "local", one.asked, True, "never")
+        write_json(service.store.runs / run / "request.json", asdict(request))
+        (service.store.runs / run / "run.mcap").write_bytes(b"log")
+    monkeypatch.setattr(service.supervisor, "work", lambda *_: {"document": {"results": [], "settings": []}})
+    path = f"/runs/compare?runs={one.id},{rehearsed.id}"
+    told = call("GET", path, 422)["error"]
+    assert "this run is a rehearsal of faults" in told["message"] and told["where"] == f"run {rehearsed.id}"
+    call("GET", f"{path}&rehearsals=true", 200)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
+import json
 import os
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,13 +14,15 @@ import pytest
 
 from profiles import STAGE_NUMBERS
 from tdhil.buses import all_buses
+from tdhil.service import fleets as fleets_module
 from tdhil.service import worker
 from tdhil.service.fleets import Fleets
 from tdhil.service.run_state import Conflict
 from tdhil.service.start_request import Rigs
+from tdhil.service.store import read_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
-from tests.service.conftest import wait_for
+from tests.service.conftest import HANGS_S, wait_for
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -143,6 +148,40 @@ def test_a_fleet_that_is_ended_or_whose_web_dies_keeps_what_is_done(call, servic
     assert again.get(fleet).state == "interrupted"
     call("POST", f"/fleets/{fleet}/stop", 200, json={})
     wait_for("its end", lambda: fleets.get(fleet).state == "interrupted")
+
+
+class PlayedFleet:
+    """The process of a fleet as the web sees it: a row, a rehearsal, and no end before the test allows it."""
+
+    def __init__(self, *_: object, **more: object) -> None:
+        self.stdin, self.stdout, self.over = io.BytesIO(), self, threading.Event()
+
+    def __iter__(self):
+        for log, faults in (("run.mcap", None), ("rehearsal.mcap", "spike=3")):
+            yield json.dumps({"row": {"log": log, "error_kind": None, "rehearsed_faults": faults}}).encode()
+        self.over.wait(HANGS_S)
+
+    def wait(self) -> int:
+        return 0
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_the_rows_of_a_fleet_include_rehearsals_only_if_asked_for(call, service, logs, monkeypatch, asked):
+    played = []
+    monkeypatch.setattr(fleets_module.subprocess, "Popen", lambda *_, **more: played.append(PlayedFleet()) or played[0])
+    service.web.fleets = fleets = Fleets(service.store, {"logs": logs}, lambda: False)
+    body = {"folder": "logs"} | ({"rehearsals": True} if asked else {})
+    fleet = call("POST", "/fleets", 202, json=body)["id"]
+    wait_for("both rows", lambda: fleets.get(fleet).done == 2)
+    found = [one["log"] for one in call("GET", f"/fleets/{fleet}/rows", 200)]
+    assert found == ["run.mcap", "rehearsal.mcap"][: 1 + asked]
+    assert call("GET", f"/fleets/{fleet}", 200)["rehearsals"] is asked
+    played[0].over.set()
+    wait_for("its end", lambda: fleets._going is None)
+    assert read_json(service.store.folder / "fleets" / fleet / "request.json").get("rehearsals", False) is asked
+    assert call("GET", f"/fleets/{fleet}", 200)["rehearsals"] is asked
 
 
 @pytest.mark.heavy(but_first=6)

@@ -13,7 +13,7 @@ import pytest
 
 from tdhil.errors import UsageError
 from tdhil.service.notifications import Notifier
-from tdhil.service.store import Summary
+from tdhil.service.run_filter import Summary
 from tdhil.service.webhook import SECRET_FILE, SIGNATURE, Webhook
 from tests.service.conftest import wait_for
 

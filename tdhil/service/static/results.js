@@ -298,10 +298,10 @@
   const NO_RIG = tr("Uploaded recording");         // as the title of its page
   const TURNED = ["sort", "order", "page", "until"];        // what an address of the list has beside its fields
   function runsPage() {
-    const chosen = new Set(), link = byId("compare"), none = byId("none"), form = byId("search"), turn = byId("turn");
+    const chosen = new Map(), link = byId("compare"), none = byId("none"), form = byId("search"), turn = byId("turn");
     const heads = [...document.querySelectorAll("[data-key]")], named = [...form.elements].filter((one) => one.name);
     let query = new URLSearchParams(), found = null, shown = "", asking = 0;
-    link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}${form.elements.archived.checked ? "&archived=true" : ""}`));
+    link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen.keys()].sort().join()}${form.elements.archived.checked ? "&archived=true" : ""}${[...chosen.values()].some(Boolean) ? "&rehearsals=true" : ""}`));
     function said() {
       const enough = chosen.size >= 2 && chosen.size <= 8;
       link.disabled = !enough;
@@ -346,7 +346,7 @@
       show(byId("runs"), ...(found.runs.length ? found.runs.map((one) => {
         const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: `${one.rig || NO_RIG}, ${when(one.asked)}` }), disabled: one.verdict === null });
         box.checked = chosen.has(one.id);
-        box.addEventListener("change", () => { if (box.checked) chosen.add(one.id); else chosen.delete(one.id); said(); });
+        box.addEventListener("change", () => { if (box.checked) chosen.set(one.id, one.rehearsal); else chosen.delete(one.id); said(); });
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig || NO_RIG}, ${when(one.asked)}` }, one.rig || NO_RIG), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
           el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict ? word(one.verdict, "verdict") : ""),
@@ -474,24 +474,32 @@
     alive();
   }
 
-  /** The part of an address that asks for archived runs, too, as this page's own address does. */
-  const archivedToo = (before = "?") => (new URLSearchParams(location.search).get("archived") === "true" ? `${before}archived=true` : "");
+  const LEFT_OUT = { archived: tr("Without archived runs"), rehearsals: tr("Without rehearsals") };
+  /** The part of an address that asks for archived runs or rehearsals, too, as this page's own address does. */
+  function askedToo(before = "?") {
+    const here = new URLSearchParams(location.search), found = Object.keys(LEFT_OUT).filter((one) => here.get(one) === "true");
+    return found.length ? `${before}${found.map((one) => `${one}=true`).join("&")}` : "";
+  }
 
   // -- a rig over time
 
   function historyPage() {
-    const rig = document.body.dataset.rig, where = byId("history"), link = byId("archived"), at = (date) => new Date(date).getTime() / 1000;
-    if (archivedToo()) { link.href = location.pathname; link.textContent = tr("Without archived runs"); }
+    const rig = document.body.dataset.rig, where = byId("history"), at = (date) => new Date(date).getTime() / 1000;
+    for (const [name, without] of Object.entries(LEFT_OUT)) {
+      const query = new URLSearchParams(location.search), link = byId(name);
+      if (query.get(name) === "true") { query.delete(name); link.textContent = without; } else query.set(name, "true");
+      link.href = `${location.pathname}${query.size ? `?${query}` : ""}`;
+    }
     once(where, async () => {
-      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend${archivedToo()}`, undefined, {}, 120000);
+      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend${askedToo()}`, undefined, {}, 120000);
       show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, english(one))));
       for (const quantity of trend.quantities.filter((one) => one.points.length)) {
         const plot = el("div", { class: "plot", role: "img", "aria-label": tr("{quantity} over time", { quantity: word(quantity.name) }) });
         where.append(el("section", {}, el("h2", {}, `${word(quantity.name)}, ${quantity.unit}`),
           el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, english(quantity.text)),
-          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}${archivedToo("&")}` }, tr("Compare the runs before and after, {first} and {second}", { first: when(one.before_date), second: when(one.after_date) })))),
+          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}${askedToo("&")}` }, tr("Compare the runs before and after, {first} and {second}", { first: when(one.before_date), second: when(one.after_date) })))),
           el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot, el("p", { class: "dim said" }, where.dataset.said)),
-          numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
+          numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("span", {}, el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), " ", rehearsal(one.rehearsed_faults) || ""), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { time: true, place: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
@@ -503,7 +511,7 @@
   function comparePage() {
     const where = byId("compared"), runs = new URLSearchParams(location.search).get("runs") || "";
     once(where, async () => {
-      const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}${archivedToo("&")}`, undefined, {}, 300000);
+      const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}${askedToo("&")}`, undefined, {}, 300000);
       const names = comparison.results.map((one, k) => `${one.rig || "?"}, ${when(one.date) || ids[k]}`);
       const dot = (k) => el("span", { class: `dot c${k}`, "aria-hidden": "true" });
       const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || "", " ", rehearsal(comparison.results[k].rehearsed_faults) || "", " ", uploaded(comparison.results[k].uploaded) || ""));
@@ -672,7 +680,7 @@
       if (now === shown) return;
       shown = now;
       show(byId("fleets"), ...(found.length ? found.map((one) => el("tr", {}, el("th", { scope: "row" }, el("a", { href: `/fleets/${one.id}` }, when(one.asked))),
-        el("td", {}, one.folder || tr("the runs of this service"), one.below ? `, ${one.below}` : "", one.archived ? `, ${tr("archived too")}` : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
+        el("td", {}, one.folder || tr("the runs of this service"), one.below ? `, ${one.below}` : "", one.archived ? `, ${tr("archived too")}` : "", one.rehearsals ? `, ${tr("rehearsals too")}` : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
         : [el("tr", {}, el("td", { colspan: 4, class: "dim" }, tr("none yet")))]));
     });
   }
@@ -693,7 +701,7 @@
 
   function fleetSummary(found) {
     const counts = [...Object.entries(found.verdicts).map(([verdict, count]) => [word(verdict, "verdict"), count]), ...Object.entries(found.failed).map(([kind, count]) => [tr("failed: {kind}", { kind }), count])];
-    const more = [[tr("from a part of the run"), (found.in_part || []).length], [tr("finished before"), found.done_before], [tr("different from the result in the log"), found.changed.length], [tr("skipped: being written"), found.live], [tr("skipped: CSV without a .yaml"), found.bare_traces], [tr("remaining"), found.left]].filter(([, count]) => count);
+    const more = [[tr("from a part of the run"), (found.in_part || []).length], [tr("finished before"), found.done_before], [tr("different from the result in the log"), found.changed.length], [tr("skipped: being written"), found.live], [tr("skipped: CSV without a .yaml"), found.bare_traces], [tr("rehearsals, left out"), found.rehearsals], [tr("remaining"), found.left]].filter(([, count]) => count);
     return [el("h2", {}, tr("Summary")), el("div", { class: "two" },
       region(tr("Number of logs"), el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
       el("div", {}, el("p", {}, tr("{count} logs in {time}, {cpu} of processor time.", { count: found.logs, time: span(found.wall_s), cpu: span(found.cpu_s) })),
@@ -730,7 +738,7 @@
       try { await work(); } catch (error) { away(whyOf(error)); }
     };
     byId("end").addEventListener("click", () => press(() => call("POST", `/fleets/${id}/stop`, {})));
-    byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, archived: view.archived, ...view.settings })));
+    byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, archived: view.archived, rehearsals: view.rehearsals, ...view.settings })));
     byId("more").addEventListener("click", () => press(() => { wanted += 200; return rows(); }));
   }
 

@@ -90,3 +90,25 @@ def test_the_list_with_its_filters_fits(page, many, width):
     page.goto("/runs?page=2")
     page.get_by_text("Page 2 of 3").wait_for()
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.heavy
+def test_a_rehearsal_is_compared_once_it_is_chosen_and_a_history_has_it_if_asked(page, served):
+    served.service.index.rebuild()
+    for one, rehearsal in zip(rows(2), (False, True), strict=True):
+        served.service.index.put(replace(one, rig="a", state="done", verdict="valid", inertia_kg_m2=104.0,
+                                         archived=False, uploaded=False, rehearsal=rehearsal))
+    page.goto("/runs")
+    page.get_by_text("Runs 1 to 2 of 2").wait_for()
+    for box in page.locator("#runs input").all():
+        box.check()
+    page.get_by_role("button", name="Compare", exact=True).click()
+    page.wait_for_url("**/compare?runs=*&rehearsals=true")
+    page.goto("/rigs/a?archived=true")
+    page.get_by_text("1 rehearsal of faults on the simulated drive: left out").wait_for()
+    page.get_by_role("link", name="Rehearsals too").click()
+    page.wait_for_url("**/rigs/a?archived=true&rehearsals=true")
+    page.get_by_text("no run has a result yet").wait_for()
+    assert page.get_by_text("left out").count() == 1           # the torque scale, in the head of the page
+    page.get_by_role("link", name="Without rehearsals").click()
+    page.wait_for_url("**/rigs/a?archived=true")
