@@ -44,13 +44,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
+from statistics import NormalDist, median
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-
-from tdhil.estimation import normal_quantile
 
 FloatArray = NDArray[np.float64]
 
@@ -59,6 +57,7 @@ ALARM: Final = 0.1
 LEAST: Final = 4
 """Least number of results in a history. Fewer can be compared in pairs."""
 
+_NORMAL: Final = NormalDist()       # the quantile of tdhil.estimation would load that whole package: 0.4 s
 _SPREAD: Final = ((0.5, 0.10), (0.7, 0.20), (1.0, 0.40), (1.4, 0.15), (2.0, 0.10), (2.8, 0.05))     # κ, its prior
 _SIZES: Final = (2.0, 4.0, 8.0, 16.0, 32.0)            # τ in units of the median σ_k, each as likely
 _PASSES: Final = 8          # most searches for the places of several steps; two to three suffice
@@ -176,7 +175,7 @@ def _on_scale(one: Measured, relative: bool) -> tuple[float, float]:
     """Return the logarithm of the value with its standard deviation, or the value itself with its own."""
     if not one.low <= one.high or not 0.0 < one.confidence < 1.0:
         raise ValueError(f"no interval: {one.low:g} to {one.high:g} at {one.confidence:g}")
-    quantile = normal_quantile(one.confidence)
+    quantile = _NORMAL.inv_cdf(0.5 + 0.5 * one.confidence)
     if relative:
         return math.log(one.value), (math.log(one.high) - math.log(one.low)) / (2.0 * quantile)
     return one.value, (one.high - one.low) / (2.0 * quantile)
@@ -255,7 +254,7 @@ def _evidence(known: _Series) -> _ChangeEvidence:
     x = known.x - known.x.mean()                               # P takes out any constant; a small x is more exact
     span = time[-1] - time[0]
     rise = (time - time[0]) / span if span > 0.0 else np.arange(n) / (n - 1.0)
-    sizes = np.median(known.sd) * np.array(_SIZES)
+    sizes = median(known.sd) * np.array(_SIZES)                # np.median loads numpy.ma: 40 ms
     weights, ratios, means, variances = [], [], [], []
     for spread, prior in _SPREAD:
         inverse = _Inverse.of(known, spread)
@@ -372,7 +371,7 @@ def _placed(known: _Series, found: Sequence[_FoundStep]) -> list[_FoundStep]:
 
 
 def _size(mean: float, sd: float, confidence: float, relative: bool, shared: bool = True) -> Difference:
-    half = normal_quantile(confidence) * sd
+    half = _NORMAL.inv_cdf(0.5 + 0.5 * confidence) * sd
     out = math.expm1 if relative else float
-    probability = NormalDist().cdf(abs(mean) / sd) if sd > 0.0 else 1.0 if mean else 0.5
+    probability = _NORMAL.cdf(abs(mean) / sd) if sd > 0.0 else 1.0 if mean else 0.5
     return Difference(out(mean), out(mean - half), out(mean + half), confidence, relative, shared, probability)

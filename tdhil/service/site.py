@@ -256,7 +256,7 @@ class Site:
         found, rehearsal = [], None if rehearsals else False
         wanted = RunFilter(rig, archived=archived, answered=True, rehearsal=rehearsal, uploaded=False)
         for one in self.find_runs(wanted, limit=TREND_RUNS):
-            row = read_json(self.store.place(one.id) / "row.json")
+            row = read_json(self.store.runs / one.id / "row.json")
             if one.state != State.DONE:
                 row = {"log": one.id, "verdict": one.verdict, "rig": rig, "aborted_by": one.state, **(row or {})}
             if row is not None:
