@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from tdhil.config import OF_EVIDENCE, PUBLISHABLE, EvidenceOptions
+from tdhil.evidence.leaks import leaks_in
 
 PARTS: Final = tuple(name for name, _ in PUBLISHABLE)
 """Parts that a publisher may permit to publish."""
@@ -112,6 +113,8 @@ def wrong_in(given: EvidenceOptions) -> list[tuple[str, str]]:
             wrong.append((option.name, f"must be at most {option.longest} characters"))
         elif option.known and value is not None and value not in option.known:
             wrong.append((option.name, f"must be {' or '.join(option.known)}"))
+        elif isinstance(value, str) and (kinds := leaks_in([value])):
+            wrong.append((option.name, f"contains a private text ({' and '.join(kinds)}): state it without"))
     return wrong
 
 

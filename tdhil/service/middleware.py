@@ -19,7 +19,6 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
-from tdhil.config import OPTION
 from tdhil.errors import CsvMisnamed, CsvUnusable, ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.access import token_in
 from tdhil.service.run_channel import RunRefused
@@ -148,11 +147,7 @@ def error_view(error: BaseException) -> ErrorView:
 
 def fields_of(wrong: Sequence[tuple[str, str]]) -> list[FieldError]:
     """Return wrong values, each with its label on the form."""
-    found = []
-    for name, text in wrong:
-        form = OPTION[name].form if name in OPTION else None
-        found.append(FieldError(name, label_of(name) if form is None else form.label, text))
-    return found
+    return [FieldError(name, label_of(name), text) for name, text in wrong]
 
 
 def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:

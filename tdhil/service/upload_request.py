@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
-from tdhil.config import ASKED_AGAIN, OF_A_TRACE, OPTION, STATED, Option
+from tdhil.config import ASKED_AGAIN, OF_A_TRACE, OF_EVIDENCE, OPTION, OPTIONS, STATED
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.start_request import ValuesWrong, limits_in_words, value_of
 
@@ -15,6 +15,7 @@ RIG: Final = "rig"
 _ALSO: Final = (*ASKED_AGAIN, *(OPTION[name] for name in STATED))
 ACCEPTED: Final = MappingProxyType({one.name: one for one in (*OF_A_TRACE, *_ALSO)})
 """Options of a request about an upload, by name."""
+_LABELS: Final = {one.name: one.form.label for one in (*OF_EVIDENCE, *OF_A_TRACE, *OPTIONS) if one.form is not None}
 _OF_A_TRACE: Final = frozenset(one.name for one in OF_A_TRACE)
 _COLUMNS: Final = next(one.name for one in OF_A_TRACE if one.joined)
 _RATED: Final = next(one.name for one in OF_A_TRACE if one.flag == "--rated-torque")
@@ -30,11 +31,8 @@ def field_of(quantity: str) -> str:
 
 
 def label_of(name: str) -> str:
-    """Return the label of a field on the page."""
-    option: Option | None = ACCEPTED.get(name)
-    if option is not None and option.form is not None:
-        return option.form.label
-    return f"column of {name.partition('.')[2]}" if name.startswith(f"{_COLUMNS}.") else name
+    """Return the label of a field on any form of the pages."""
+    return _LABELS.get(name) or (f"column of {name.partition('.')[2]}" if name.startswith(f"{_COLUMNS}.") else name)
 
 
 def upload_options(body: Mapping[str, Any], kind: str) -> tuple[dict[str, Any], list[tuple[str, str]]]:

@@ -52,13 +52,17 @@ def test_every_mistake_of_the_statement_is_said_at_its_field(call, service, run)
     refused = call("POST", f"/runs/{run}/evidence", 422, json=sent)
     assert {one["option"] for one in refused["fields"]} == {
         "publisher", "publish", "reference_inertia_kg_m2", "reference_sd_kg_m2", "reference_method", "reference_note"}
+    labels = {one["option"]: one["label"] for one in refused["fields"]}     # as on the form, not the option's name
+    assert labels["publisher"] == "Publisher: who permits this" and labels["reference_note"] == "How, in words"
     call("POST", f"/runs/{run}/evidence", 422, json={**STATED, "photo": 1})
     assert not noted(service, "evidence requested")
 
 
 def test_a_private_text_is_refused_and_leaves_no_archive(call, service, run):
-    told = call("POST", f"/runs/{run}/evidence", 422, json={**STATED, "firmware": "from 10.1.2.3"})
+    sent = {**STATED, "firmware": "from 10.1.2.3", "publisher": "ops@example.com, 192.168.0.7"}
+    told = call("POST", f"/runs/{run}/evidence", 422, json=sent)
     assert "private text" in told["error"]["message"] and "10.1.2.3" not in json.dumps(told)
+    assert {one["option"] for one in told["fields"]} == {"publisher", "firmware"}      # both, each at its field
     assert not (service.store.place(run) / "evidence.zip").exists()
 
 

@@ -281,14 +281,34 @@
       field.setAttribute("aria-invalid", "true");
       field.setAttribute("aria-describedby", note.id);
       (field.closest("label") || field).append(note);
-      const closed = field.closest("details");
-      if (closed) closed.open = true;
+      opens(field);
     });
-    if (known.length && go) {
-      const field = form.elements[known[0].option];
-      (field.querySelector("input") || field).focus();
-    }
+    if (known.length && go) focus(form.elements[known[0].option]);
     return known.length;
+  }
+  /** Open what hides a field. */
+  function opens(field) {
+    for (let closed = field.closest("details"); closed; closed = closed.parentElement.closest("details")) closed.open = true;
+  }
+  const focus = (field) => (field.querySelector("input") || field).focus();
+  /** Return a message with the labels of this form in place of the command line's options. Mark these fields: the text `said` describes them. */
+  function byLabels(form, message, said, go = true) {
+    const flag = (one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`, "g");
+    const mine = [...form.querySelectorAll("[data-flag]")].filter((one) => flag(one).test(message));
+    const fields = mine.map((one) => (one.name ? one : one.querySelector("[name]")));
+    fields.forEach((one) => {
+      one.setAttribute("aria-invalid", "true");
+      one.setAttribute("aria-describedby", said.id);
+      opens(one);
+    });
+    if (fields.length && go) focus(fields[0]);
+    return mine.reduce((text, one) => text.replaceAll(flag(one), `$1“${one.dataset.label}”`), message);
+  }
+  /** Show a refusal, all at once: each wrong field of the form is marked with its reason, and the text `said` has the others. */
+  function refused(form, said, error, go = true) {
+    const fields = error.fields || [], others = fields.filter((one) => !form.elements[one.option]);
+    if (others.length || !fields.length) tell(said, new Refused(fields.length ? others.map((one) => `${word(one.label)}: ${worded(one.message)}`).join("; ") : byLabels(form, whyOf(error), said, go)));
+    markWrong(form, fields, go);
   }
   function unmark(form) {
     form.querySelectorAll("[aria-invalid]").forEach((one) => {
@@ -316,8 +336,7 @@
     try {
       await send();
     } catch (error) {
-      if (error.fields && markWrong(form, error.fields)) return;
-      tell(said, error);
+      refused(form, said, error);
     } finally {
       sending.delete(form);
     }
@@ -398,7 +417,6 @@
     if (!form) return;
     const paced = pacing(rig, form);
     let key = null, keyFor = "";
-    const flagged = [...form.querySelectorAll("[data-flag]")], fieldOf = (label) => label.querySelector("[name]");
     /** Say an error with the labels of this form in place of the command line's options, and mark these fields. */
     function refuse(message, fields = []) {
       byId("plan").hidden = true;            // the plan of other values
@@ -408,16 +426,7 @@
         markWrong(form, fields);
         return;
       }
-      const mine = flagged.filter((one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`).test(message));
-      const text = mine.reduce((said, one) => said.replaceAll(new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`, "g"), `$1“${one.dataset.label}”`), message);
-      mine.map(fieldOf).forEach((one) => {
-        one.setAttribute("aria-invalid", "true");
-        one.setAttribute("aria-describedby", "said");
-        const closed = one.closest("details");
-        if (closed) closed.open = true;
-      });
-      show(byId("said"), el("p", { class: "alarm", role: "alert" }, text));
-      if (mine.length) fieldOf(mine[0]).focus();
+      show(byId("said"), el("p", { class: "alarm", role: "alert" }, byLabels(form, message, byId("said"))));
     }
     every(3000, async () => {
       const found = await call("GET", `/rigs/${encodeURIComponent(rig)}`);
@@ -862,7 +871,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, byLabels, call, closes, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

@@ -666,14 +666,12 @@
     const form = byId("ask");
     let shown = "";
     call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || tr("the runs of this service")))), () => {});
-    form.addEventListener("submit", async (event) => {
+    form.addEventListener("submit", (event) => {
       event.preventDefault();
-      try {
+      submits(form, byId("said"), async () => {
         const found = await call("POST", "/fleets", asked(form));
         location.assign(`/fleets/${found.id}`);
-      } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, whyOf(error)));
-      }
+      });
     });
     every(2000, async () => {
       const found = await call("GET", "/fleets"), now = JSON.stringify(found);

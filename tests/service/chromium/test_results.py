@@ -9,9 +9,13 @@ import threading
 import zipfile
 from io import BytesIO
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from tdhil.errors import UsageError
+from tdhil.service.run_channel import RunRefused
+from tdhil.service.run_state import Told
 from tdhil.service.store import write_json
 from tests.recording.test_log_tail import write
 from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, begin, estimate, results
@@ -264,12 +268,26 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
         assert [one["id"] for one in page.evaluate("axe.run()")["violations"]
                 if one["impact"] in ("serious", "critical")] == []
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    firmware, remove = page.get_by_label("Firmware version"), page.get_by_label("Further words to remove")
     for part in page.get_by_role("group", name="Parts that may be published").get_by_role("checkbox").all():
         part.check()
     for label, text in (("Publisher: who permits this", HOSTILE), ("Its standard uncertainty", "1"),
                         ("How, in words", "a disc of 480 kg")):
         page.get_by_role("textbox", name=label).fill(text)
     page.get_by_label("How it is known").select_option("weighed")
+    firmware.fill("from 10.1.2.3")
+    page.get_by_role("button", name="Make the archive").click()
+    page.locator("#wrong-firmware", has_text="private text (IP address)").wait_for()
+    assert (firmware.get_attribute("aria-invalid"), firmware.input_value()) == ("true", "from 10.1.2.3")
+    firmware.fill("3.1")
+    leak = UsageError("the archive would contain a private text", next_step="Remove a word with --remove")
+    with monkeypatch.context() as patched:      # found in the log: the worker names an option
+        patched.setattr("tdhil.evidence.make_evidence", Mock(side_effect=leak))
+        page.get_by_role("button", name="Make the archive").click()
+        said = page.locator("#evidence-said")
+        said.wait_for()
+    assert "“Further words to remove”" in said.inner_text() and "--remove" not in said.inner_text()
+    assert (remove.get_attribute("aria-invalid"), firmware.input_value()) == ("true", "3.1")
     page.get_by_role("button", name="Make the archive").click()
     link = page.get_by_role("link", name="evidence.zip")
     link.wait_for()
@@ -460,6 +478,40 @@ def test_a_trace_is_added_with_its_columns_corrected_and_becomes_a_marked_run(pa
     assert page.locator("b#x").count() == 0
     page.goto("/runs")
     page.locator("#runs .badge", has_text="UPLOADED").wait_for()
+
+
+@pytest.mark.heavy
+def test_a_refused_identification_names_and_marks_its_fields_and_keeps_what_was_typed(page, served, monkeypatch):
+    """Also the refusal of the worker process, which names options of the command line, and one of no field."""
+    play_uploads(served.service, monkeypatch)
+    works = served.service.supervisor.work
+
+    def refuses(what, run, asked):
+        if what == "upload":
+            said = "The torque of --gear and --rated-torque differs"
+            raise RunRefused(Told("UsageError", said, said, "", "Give --gear-ratio", 2, "TDH-204"))
+        return works(what, run, asked)
+
+    monkeypatch.setattr(served.service.supervisor, "work", refuses)
+    page.goto("/upload")
+    page.set_input_files("#file", {"name": "x.csv", "mimeType": "text/csv", "buffer": TRACE.encode()})
+    page.locator(".wrong").wait_for()
+    rated, note = page.get_by_label("Rated torque, N·m"), page.get_by_label("Note")
+    rated.fill("480")
+    rated.press("Tab")
+    page.locator(".mini canvas").nth(1).wait_for()
+    note.fill("after the repair")
+    page.get_by_role("button", name="Identify").click()
+    said = page.locator("#mapping-said")
+    said.wait_for()
+    assert "“Rated torque, N·m”" in said.inner_text() and "--rated-torque" not in said.inner_text()
+    assert (rated.get_attribute("aria-invalid"), rated.get_attribute("aria-describedby")) == ("true", "mapping-said")
+    assert (rated.input_value(), note.input_value()) == ("480", "after the repair")
+    wrong = [("columns", "one column can't hold two quantities"), ("rated_torque_nm", "must be above 0")]
+    monkeypatch.setattr("tdhil.service.upload_routes.upload_options", lambda body, kind: ({}, list(wrong)))
+    page.get_by_role("button", name="Identify").click()
+    page.locator("#wrong-rated_torque_nm").wait_for()
+    assert said.inner_text() == "columns: one column can't hold two quantities"        # of no field: it was left out
 
 
 @pytest.mark.heavy
