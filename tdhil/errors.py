@@ -245,6 +245,12 @@ def of_the_system(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _THE_SYSTEM_S
 
 
+def existing_file(where: object, what: str = "already exists") -> UsageError:
+    """Return the refusal to overwrite a file. ``where``: the file, or the option with it; ``what``: the reason."""
+    return UsageError(f"{what} and was not overwritten", where=str(where),
+                      next_step="Name another file, or move the existing one", entry=MessageCode.FILE_EXISTS)
+
+
 def shown(text: str) -> str:
     """Return ``text`` for a message: printable, on one line, at most 40 characters."""
     clean = "".join(sign if sign.isprintable() else "·" for sign in text[:41])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tdhil.cli.replay import read_recorded
 from tdhil.cli.report_file import ReportFile
 from tdhil.cli.results import print_json
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, UsageError, existing_file
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -54,8 +54,7 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
 def require_new(path: Path | None) -> None:
     """Raise UsageError if the file exists already."""
     if path is not None and path.exists():
-        raise UsageError("already exists and was not overwritten", where=f"--save {path}",
-                         next_step="Name another file, or move the existing one")
+        raise existing_file(f"--save {path}")
 
 
 def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:

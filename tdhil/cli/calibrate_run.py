@@ -11,7 +11,7 @@ from pathlib import Path
 from profiles.quantities import INERTIA
 from tdhil.cli.arguments import amount, hide_rare
 from tdhil.config import OPTION, load_rig, resolve
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, UsageError, existing_file
 
 _EXAMPLE = "tdhil identify --calibrate --added 55"
 _LARGEST = 1e9
@@ -67,8 +67,7 @@ def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
     saved = first.with_name(f"{first.stem}-calibration.json")
     check_log_path(second, OPTION["log"].flag)
     if saved.exists():
-        raise UsageError("already exists and was not overwritten", where=str(saved),
-                         next_step="Move that file away, or name another log with --log")
+        raise existing_file(saved)
     if options.json or options.trace is not None:
         raise UsageError("does not go with --calibrate", where=options.source("json" if options.json else "trace"))
     if not peer.embedded:

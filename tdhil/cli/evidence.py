@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.arguments import add_option
 from tdhil.config import OF_EVIDENCE, EvidenceOptions
-from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError, existing_file
 
 if TYPE_CHECKING:
     from tdhil.evidence import EvidenceCheck
@@ -60,8 +60,7 @@ def _make(namespace: argparse.Namespace) -> int:
         also = f" ({', '.join(flag_of(one) for one, _ in more)} too)" if more else ""
         raise UsageError(f"{why}{also}", where=flag_of(name), entry=MessageCode.EVIDENCE_STATEMENT)
     if target.exists():
-        raise UsageError("already exists and was not overwritten", where=str(target),
-                         next_step="Name another file with -o", entry=MessageCode.FILE_EXISTS)
+        raise existing_file(target)
     words = (*given.remove, *names_of_this_computer())
     made = make_evidence(log, statement_of(given), words, serial_key=_key(namespace.serial_key))
     try:

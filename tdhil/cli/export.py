@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
-from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, UsageError, existing_file
 
 if TYPE_CHECKING:
     from drivers import RawFrame
@@ -50,8 +50,7 @@ def run(namespace: argparse.Namespace) -> int:
         raise UsageError("this log does not exist", where=str(path), next_step="Name a run.mcap of tdhil",
                          entry=MessageCode.FILE_NOT_FOUND)
     if target.exists():
-        raise UsageError("already exists and was left unchanged", where=str(target),
-                         next_step="Name another file with -o", entry=MessageCode.FILE_EXISTS)
+        raise existing_file(target)
     if namespace.to == "parquet":
         _duckdb()
     try:

@@ -18,7 +18,7 @@ from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.csv_text import cell_of
-from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError, existing_file
 from tdhil.session import is_evaluation, is_verification, require_file
 
 if TYPE_CHECKING:
@@ -104,8 +104,7 @@ def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
             raise UsageError("is the log itself", where=where, next_step="Name another file",
                              entry=MessageCode.SAME_FILE_TWICE)
         if path.exists():
-            raise UsageError("already exists and was left unchanged", where=where, next_step="Name another file",
-                             entry=MessageCode.FILE_EXISTS)
+            raise existing_file(where)
         if not path.parent.is_dir():
             raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
                              entry=MessageCode.FILE_NOT_WRITABLE)

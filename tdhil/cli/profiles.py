@@ -23,7 +23,7 @@ from tdhil.buses import (
 from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode
+from tdhil.errors import ExitCode, existing_file
 from tdhil.session import UNVERIFIED_FLAG, doubtful
 
 if TYPE_CHECKING:
@@ -261,8 +261,7 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
         with target.open("x", encoding="utf-8") as stream:
             stream.write(begun.text)
     except FileExistsError:
-        message = "already exists and was left unchanged; name another file with -o"
-        raise DataFileError((Problem(str(target), 0, message),)) from None
+        raise existing_file(target) from None
     except OSError as error:
         message = f"can't be written ({error.strerror or error}); name another path with -o"
         raise DataFileError((Problem(str(target), 0, message),)) from error

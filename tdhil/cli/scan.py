@@ -15,7 +15,7 @@ from profiles import load_profile, visible
 from tdhil.buses import FoundDrive, all_buses, examples
 from tdhil.cli.results import print_json
 from tdhil.config import load_rig, resolve
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import MessageCode, UsageError, existing_file
 from tdhil.session import starter
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.session import connection_of, plan_peer
 
     if namespace.write is not None and namespace.write.exists():
-        raise _there_already(namespace.write)
+        raise existing_file(namespace.write)
     rig = load_rig(namespace.rig) if namespace.rig else None
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
     if not (options.simulate or connection.configured):
@@ -87,16 +87,11 @@ def write_new(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise _there_already(path) from None
+        raise existing_file(path) from None
     except OSError as error:
         step = "Name a file in a folder that you may write to"
         raise UsageError(f"can't be written ({error.strerror or error})", where=str(path), next_step=step,
                          entry=MessageCode.FILE_NOT_WRITABLE) from error
-
-
-def _there_already(path: Path) -> UsageError:
-    return UsageError("already exists and was not overwritten", where=str(path), next_step="Name another file",
-                      entry=MessageCode.FILE_EXISTS)
 
 
 def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.buses import all_buses
-from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
+from tdhil.errors import ExitCode, LogError, MessageCode, UsageError, existing_file
 from tdhil.evidence import Scrub
 from tdhil.version import __version__
 
@@ -60,8 +60,7 @@ def run(namespace: argparse.Namespace) -> int:
             whole = _add_log(archive, log, scrub)
             names = archive.namelist()
     except FileExistsError:
-        raise UsageError("already exists and was not overwritten", where=str(target),
-                         next_step="Name another file with -o", entry=MessageCode.FILE_EXISTS) from None
+        raise existing_file(target) from None
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=str(target),
                          entry=MessageCode.FILE_NOT_WRITABLE) from error

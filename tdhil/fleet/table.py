@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from tdhil.csv_text import cell_of, text_of
-from tdhil.errors import LogBroken, LogUnopened, MessageCode, UsageError
+from tdhil.errors import LogBroken, LogUnopened, MessageCode, UsageError, existing_file
 from tdhil.fleet.rows import COLUMNS, FleetRow, row_from_json
 
 _TABLE: Final = "fleet"
@@ -112,8 +112,7 @@ def check_table_path(path: Path, folder: Path) -> None:
     if path.suffix == ".parquet":
         load_duckdb()
     if path.exists() and not folder.is_dir():
-        raise UsageError("is a file that no fleet wrote; it is left as it is", where=f"--out {path}",
-                         next_step="Name another", entry=MessageCode.FLEET_TABLE_WRONG)
+        raise existing_file(f"--out {path}", "is a file that no fleet wrote")
 
 
 def write_table(rows: Sequence[FleetRow], path: Path) -> None:

@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import MessageCode, UsageError, existing_file
 from tdhil.file_hash import sha256_of
 from tdhil.recording import Recording
 from tdhil.report.blocks import WIDTH_IN, Picture, Report, report_of
@@ -39,9 +39,7 @@ def check_report_path(path: Path, *inputs: Path, where: str = "--report") -> Non
         raise UsageError("is a folder; a report is a file", where=f"{where} {path}", next_step="Such as report.html",
                          entry=MessageCode.FILE_NOT_WRITABLE)
     if path.exists() and (path.is_file() or path.is_symlink()):
-        raise UsageError("is there already, and is left as it is", where=f"{where} {path}",
-                         next_step=f"Name another file, such as {fresh(path).name}, or move that one away",
-                         entry=MessageCode.FILE_EXISTS)
+        raise existing_file(f"{where} {path}")
     if path.suffix.lower() not in _SUFFIXES and not path.exists():      # an existing path here is a device
         raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}",
                          next_step="Name the file report.html or report.pdf",

@@ -16,7 +16,7 @@ from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from profiles import CodedText, MessageCode, entry_of, with_code
-from tdhil.errors import UsageError
+from tdhil.errors import UsageError, existing_file
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
@@ -372,8 +372,7 @@ def check_picture_path(path: Path, source: Path) -> None:
         raise UsageError("is the result itself", where=where, next_step="Name another file",
                          entry=MessageCode.SAME_FILE_TWICE)
     if path.exists():
-        raise UsageError("already exists and was left unchanged", where=where, next_step="Name another file",
-                         entry=MessageCode.FILE_EXISTS)
+        raise existing_file(where)
     if not path.parent.is_dir():
         raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
                          entry=MessageCode.FILE_NOT_WRITABLE)

@@ -15,7 +15,7 @@ from urllib.parse import quote, urlencode
 
 from drivers import CommunicationLost
 from profiles import message_of
-from tdhil.errors import MessageCode, TdhilError, UsageError
+from tdhil.errors import MessageCode, TdhilError, UsageError, existing_file
 from tdhil.service.limits import REPLY_S
 
 _API: Final = "/api/v1"
@@ -270,9 +270,10 @@ class Client:
 
     def download(self, run: str, name: str, path: str | Path) -> Path:
         """Save ``log.mcap``, ``report.html``, ``report.pdf``, ``result.json`` or ``trace.csv`` of a run as a new
-        file.
+        file. Raises UsageError if it exists.
         """
-        target = Path(path)
+        if (target := Path(path)).exists():
+            raise existing_file(target)
         with self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer, \
                 target.open("xb") as file:
             while piece := answer.read(2**16):

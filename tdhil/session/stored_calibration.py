@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers import PreflightRefused
-from tdhil.errors import UsageError
+from tdhil.errors import UsageError, existing_file
 
 if TYPE_CHECKING:
     from tdhil.calibration import StoredCalibration
@@ -49,8 +49,7 @@ def save_calibration(document: Mapping[str, Any], path: Path) -> None:
             json.dump(document, file, ensure_ascii=False, indent=2, allow_nan=False)
             file.write("\n")
     except FileExistsError:
-        raise UsageError("already exists and was not overwritten", where=f"--save {path}",
-                         next_step="Name another file, or move the existing one") from None
+        raise existing_file(f"--save {path}") from None
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}") from error
 

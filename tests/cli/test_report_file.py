@@ -50,7 +50,7 @@ def test_a_certificate_of_a_speed_calibration_has_the_head(letterhead, tmp_path,
              "--order-number", "4711-B", "--place", "Aurich"]
     assert main(asked) == 0
     assert f"report: {page}" in capsys.readouterr().err
-    assert main(asked) == 2 and "is there already" in capsys.readouterr().err
+    assert main(asked) == 2 and "already exists and was not overwritten" in capsys.readouterr().err
     data = page.read_bytes()
     if ending == "pdf":
         assert data.startswith(b"%PDF") and data.count(b"/Subtype /Image") == 1

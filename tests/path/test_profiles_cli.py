@@ -161,7 +161,7 @@ def test_a_profile_is_begun_from_an_eds(tmp_path, monkeypatch):
     before = path.read_bytes()
     again = tdhil("profiles", "import", source)
     assert (again.code, path.read_bytes()) == (2, before)
-    assert "already exists and was left unchanged; name another file with -o" in again.err
+    assert "already exists and was not overwritten. Name another file, or move the existing one" in again.err
     document = tdhil("profiles", "import", source, "-o", "mine.yaml", "--json").document
     assert document["file"] == "mine.yaml"
     assert document["unverified"] == ["identity", "modes", "quick_stop", "torque", "watchdog"]

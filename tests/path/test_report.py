@@ -67,7 +67,7 @@ def test_a_pdf_is_written_where_the_name_says_so(run):
     assert before.startswith(b"%PDF-")
     refused = tdhil("replay", run.log, "--report", page)
     assert refused.code == 2
-    assert "is there already" in refused.err
+    assert "already exists and was not overwritten" in refused.err
     assert page.read_bytes() == before
 
 

@@ -112,7 +112,7 @@ def test_the_same_result_is_the_same_file(tmp_path):
 def test_no_file_is_ever_written_over(tmp_path):
     own, old = recording(), tmp_path / "report.html"
     old.write_text("somebody's own")
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="already exists and was not overwritten"):
         check_report_path(old, tmp_path / "run.mcap")
     assert write_report(result_document(full(), own, {}, "run.mcap"), own, old) == tmp_path / "report-2.html"
     assert old.read_text() == "somebody's own"
