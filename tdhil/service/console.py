@@ -16,6 +16,7 @@ from typing import Final
 from drivers import CommunicationLost
 from profiles import visible
 from tdhil.errors import UsageError
+from tdhil.recording import REHEARSAL
 from tdhil.service.run_channel import SOCKET, RunRefused, ask, lives
 from tdhil.service.run_state import State, Status
 from tdhil.service.store import Store
@@ -40,10 +41,11 @@ class Console:
             if code and self._shown.get(run) != code:
                 self._shown[run] = code
                 text = status.confirmation.text if status.confirmation is not None else ""
-                by = visible(self._store.request(run).asked_by)
-                rig = f"{status.rig}, SIMULATED" if status.simulated else status.rig
-                self._say(f"{text}\nRig {rig}. Requested by {by}, run {run}. To let it move, type this code into the"
-                          f" page within {found['left_s']:.0f} s:   {code[:3]} {code[3:]}\n")
+                request = self._store.request(run)
+                by = visible(request.asked_by)
+                marks = ", SIMULATED" * bool(status.simulated) + f", {REHEARSAL}" * request.rehearsal
+                self._say(f"{text}\nRig {status.rig}{marks}. Requested by {by}, run {run}. To let it move, type this"
+                          f" code into the page within {found['left_s']:.0f} s:   {code[:3]} {code[3:]}\n")
 
     def forget(self, run: str) -> bool:
         """Forget a run. Return whether its code was shown."""

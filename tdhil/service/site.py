@@ -249,8 +249,8 @@ class Site:
     def trend_rows(self, rig: str, *, archived: bool = False, rehearsals: bool = False) -> list[dict[str, Any]]:
         """Return the rows of a rig's history, each with the time of the run's request, as on every page.
 
-        `tdhil.fleet.history_rows` states which of them count. An uploaded recording has no row, since its identity is
-        only stated by a person. A run that did not end as requested is a part of a run, also if it wrote no row.
+        `tdhil.fleet.trend.history_rows` states which of them count. An uploaded recording has no row, since its
+        identity is only stated by a person. A run that did not end as requested is a part of a run, also without a row.
         """
         self.supervisor.index.wait_until_made(WHOLE_INDEX_S)
         found, rehearsal = [], None if rehearsals else False

@@ -81,6 +81,11 @@ def read(text):
     return email.message_from_bytes(text, policy=policy.default)
 
 
+def test_the_subject_marks_a_rehearsal(server):
+    run = replace(DONE, simulated=True, rehearsal=True)
+    assert mail(server)._written(message_of(run))["subject"].startswith("tdhil: a SIMULATED REHEARSAL: run ended")
+
+
 def test_an_end_and_a_change_reach_each_recipient(server, monkeypatch):
     monkeypatch.setattr("tdhil.service.notifications.EVERY_S", 0.01)
     runs = [replace(DONE, simulated=True),

@@ -18,6 +18,7 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
+from tdhil.service import console as console_module
 from tdhil.service import store as store_module
 from tdhil.service.audit import KEY_FILE, Audit, ChainHead
 from tdhil.service.run_channel import lives, take_life
@@ -496,3 +497,15 @@ def test_the_audit_on_the_terminal(audit, capsys, tmp_path):
     only_file(audit).write_bytes(b"")
     assert check() != 0
     assert "chain is broken" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("options", "marks"), [({}, ", SIMULATED"), (
+    {"fault": ["sto@hold"]}, ", SIMULATED, FAULT REHEARSAL")])
+def test_the_console_at_the_rig_marks_what_waits_for_its_code(tmp_path, monkeypatch, options, marks):
+    store, said = Store(tmp_path), []
+    store.prepare()
+    run = store.new_id()
+    store.begin(StoredRequest(run, "a", "a.yaml", "0" * 64, options, "local", now(), True, "attended"))
+    monkeypatch.setattr(console_module, "ask", lambda *_: {"code": "123456", "left_s": 60.0})
+    console_module.Console(store, said.append).show(run, replace(store.status(run), simulated=True))
+    assert f"Rig a{marks}. Requested by local, run {run}" in said[0]
