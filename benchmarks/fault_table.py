@@ -21,7 +21,7 @@ from tests.faults.rows import ROWS  # noqa: E402
 HEAD = """# The faults, and what a run does about each
 
 The first fifty faults were required. The others were found by trials. `python benchmarks/fault_table.py` makes this
-page from the tests that it names.
+page from the tests that it names. If a message is reworded later, its quotation follows; the figures stay.
 
 You can rehearse any scripted row: `tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault list` shows the names).
 `NAME@stop` begins when the drive is first commanded to stop. `sim_bus/reports.py` has a table of its own, with faults
@@ -31,8 +31,8 @@ of reports, sensors and power stages.
 * **WD**: the drive's own watchdog stops the shaft.
 * **R**: refused before the shaft has moved.
 * **M**: the run continues, and the degraded part is marked.
-* *To rest*: plant time from the fault to the last movement of the simulated shaft (0.02 rad/s). Unless the row states
-  otherwise, it begins at some 4 rad/s, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop.
+* *Standstill after*: plant time from the fault to the last movement of the simulated shaft (0.02 rad/s). Unless the
+  row states otherwise, it begins at some 4 rad/s, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop.
 * *Exit*: how the process may end.
 
 """
@@ -51,7 +51,7 @@ def table(lines):
     by_row = {}
     for line in lines:
         by_row.setdefault(line["row"], []).append(line)
-    out = ["| # | fault | must | seen | to rest | log | exit |", "|---|---|---|---|---|---|---|"]
+    out = ["| # | fault | must | seen | standstill after | log | exit |", "|---|---|---|---|---|---|---|"]
     tests = ["", "## The tests", ""]
     for number, row in ROWS.items():
         found = by_row.get(number, [])

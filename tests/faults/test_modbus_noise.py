@@ -42,5 +42,5 @@ def test_row_72_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_us
     assert "NOT confirmed" not in ended.done.err
     ended.shaft.assert_at_rest()
     ended.shaft.assert_never_let_go()
-    seen(72, f"{profile}: the run {'goes on' if ended.done.code != 5 else 'is ended, the shaft seen at rest'}",
+    seen(72, f"{profile}: the run {'goes on' if ended.done.code != 5 else 'is ended, standstill is seen'}",
          None if ended.done.code != 5 else ended.standstill_s(acted[0]), ended.assert_log_whole(), ended.done.code)

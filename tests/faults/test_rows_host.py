@@ -91,8 +91,8 @@ def test_row_6_a_stop_that_is_not_confirmed(rehearse, monkeypatch, seen):
     assert "Use the hard-wired emergency stop now" in run.done.err
     assert "interrupted" in run.message              # the first cause stays the cause
     assert run.shaft.state[-1] == "quick stop active"
-    seen(6, "loud: use the hard-wired emergency stop now; the setpoint of zero brings the shaft to rest all the same,"
-         " and it is not disabled", run.assert_stopped(acted[0], NOTICED_AT_ONCE_S), run.assert_log_whole(), 8)
+    seen(6, "use the hard-wired emergency stop now; the setpoint of zero stops the shaft nevertheless, and the drive is"
+         " not disabled", run.assert_stopped(acted[0], NOTICED_AT_ONCE_S), run.assert_log_whole(), 8)
 
 
 @pytest.mark.heavy
@@ -174,7 +174,7 @@ def test_row_49_an_aborted_run_begins_anew(rehearse, seen):
     rehearse("--fault", "emcy@speed+3s").assert_ended(6)
     run = rehearse("--fault", "emcy@speed+3s")
     assert [name for name, _ in run.done.outcomes] == ["setup", "speed"]
-    seen(49, "a new run begins with a new preflight at stage 1; no option takes an older one up", None,
+    seen(49, "a new run begins with a new preflight at stage 1; no option continues an older run", None,
          run.assert_log_whole(), 6)
 
 

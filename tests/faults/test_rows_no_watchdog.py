@@ -62,7 +62,7 @@ def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
     standstill_s = run.assert_stopped(run.shaft.events("fault: ")[-1], 0.6)
     run.shaft.assert_enabled(True)
     assert "the shaft is at standstill" in run.done.document["stop"]
-    seen(50, f"{bus}, {BY_NAME}: taken, and said; `{cause}` then: {run.message}", standstill_s,
+    seen(50, f"{bus}, {BY_NAME}: accepted, and reported; `{cause}` then: {run.message}", standstill_s,
          run.assert_log_whole(), run.done.code)
 
 

@@ -59,7 +59,7 @@ def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
     events = [event.text for event in read_run(run.log).events if event.kind == "bus"]
     assert events == ["another master wrote 6040h = 6h by SDO", "another master wrote 6060h = 4h by SDO"]
     assert run.shaft.at_rest_from() <= run.shaft.time_s[-1] - 1.0
-    seen(61, f"told at the end: {warnings}", None, run.assert_log_whole(), run.done.code)
+    seen(61, f"reported at the end: {warnings}", None, run.assert_log_whole(), run.done.code)
 
 
 @pytest.mark.heavy

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.faults.rows import FIFTY, ROWS
+from tests.faults.test_ethercat_scripted import CASES as ETHERCAT
+from tests.faults.test_rows_scripted import CASES as CANOPEN
 
 ROOT = Path(__file__).parents[2]
 TABLE = ROOT / "docs" / "reference" / "faults.md"
@@ -37,3 +39,22 @@ def test_every_scripted_fault_is_rehearsed():
 
     source = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py"))
     assert [name for name in KINDS if f'"{name}' not in source] == []
+
+
+def test_the_page_states_each_fault_and_its_reaction_as_the_table(text):
+    cells = {int(found[1]): found[0].split(" | ") for found in re.finditer(r"\| (\d+) \| .*", text)}
+    assert {number: row[1:3] for number, row in cells.items()} == {
+        number: [row.fault, row.expected] for number, row in ROWS.items()}
+
+
+QUOTED = (*CANOPEN, *(case for case in ETHERCAT if ROWS[case.row].fault.startswith("EtherCAT")))
+
+
+@pytest.mark.parametrize("case", QUOTED, ids=lambda case: case.id)
+def test_a_quotation_has_the_words_that_its_case_requires(case, text):
+    """A message that is worded anew is quoted anew. The page quotes a row of all buses from CANopen."""
+    row = re.search(rf"^\| {case.row} \| .*$", text, re.MULTILINE)
+    assert row is not None
+    quoted = [one for one in re.split(r"<br>| \| ", row[0]) if one.startswith(f"`{case.fault}`: ")]
+    assert quoted
+    assert [word for one in quoted for word in case.words if word not in one] == []
