@@ -197,7 +197,7 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
     table = Table(expand=False)
     for heading in ("profile", "bus", "modes"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("watchdog", "how sure"):
+    for heading in ("watchdog", "confidence"):
         table.add_column(heading, overflow="fold")
     for profile in profiles:
         said = row(profile)

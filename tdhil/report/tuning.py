@@ -530,7 +530,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     settings = list(_setting_rows(document))
     if settings:
         sections.append(ReportSection("To be typed into the drive, by hand", (
-            Table((Column("parameter", 0.4), Column("value", 0.45), Column("how sure", 0.15)), tuple(settings)),
+            Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
             Text("Nothing here was written into any drive. Change one thing at a time, at a low speed, with the "
                  "hard-wired stop in reach."),
         )))

@@ -41,7 +41,7 @@ def require_service() -> None:
     missing = [name.replace("_", "-") for name in NEEDED if find_spec(name) is None]
     if missing:
         raise UsageError(f"the service needs {', '.join(missing)}, not installed here",
-                         next_step="Install: pip install 'tdhil[service]'", entry=MessageCode.PACKAGE_MISSING)
+                         next_step="Install it in the clone of tdhil: pip install '.[service]'", entry=MessageCode.PACKAGE_MISSING)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def serve(
                              entry=MessageCode.SERVICE_OPTION_WRONG)
     if rigs is not None and not rigs.is_dir():
         raise UsageError("this folder does not exist", where=f"--rigs {rigs}",
-                         next_step="Create it for your rig files (mkdir), or name another folder",
+                         next_step="Create it, or name another folder of rig files",
                          entry=MessageCode.FILE_NOT_FOUND)
     if missing := [folder for folder in logs if not folder.is_dir()]:
         raise UsageError("this folder does not exist", where=f"--logs {missing[0]}", next_step="Name a folder of logs",

@@ -76,6 +76,13 @@ def test_rig_yaml_loads(tmp_path):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_an_extra_is_installed_from_the_clone_or_from_a_folder(page):
+    """The pages install the clone, and no package of this name from elsewhere."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if re.search(r"pip install .*\btdhil\b", line) and "--find-links" not in line] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):

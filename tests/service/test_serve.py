@@ -291,13 +291,19 @@ def test_a_token_goes_over_tls_alone():
         tdhil.Client("https://127.0.0.1:8420", token="tdhil_x", ca="/none.pem")
 
 
+def test_a_missing_extra_is_installed_from_the_clone(monkeypatch):
+    monkeypatch.setattr(server, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"not installed here.*in the clone.*pip install '\.\[service\]'"):
+        server.require_service()
+
+
 def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsys):
     from tdhil.service.server import _alone
 
     with _alone(tmp_path), pytest.raises(UsageError, match="another tdhil serve uses this folder"):
         _alone(tmp_path)
     assert main(["serve", "--rigs", str(tmp_path / "missing"), "--data", str(tmp_path)]) == ExitCode.USAGE
-    assert "this folder does not exist" in capsys.readouterr().err
+    assert "this folder does not exist. Create it, or name another" in capsys.readouterr().err
     assert main(["serve", "--port", "99999", "--data", str(tmp_path)]) == ExitCode.USAGE
 
 
