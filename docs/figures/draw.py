@@ -274,12 +274,12 @@ def what_stops() -> Drawing:
             PALE_BLUE,
         ),
         (
-            ["shaft accelerates in the stop, or string", "and a speed that is not believed"],
+            ["shaft accelerates in the stop, or string", "and a contradicted speed report"],
             ["friction", "tdhil removes the torque"],
             PALE_ORANGE,
         ),
         (
-            ["STOP NOT CONFIRMED (exit 8)", "drive dead, anything else"],
+            ["STOP NOT CONFIRMED (exit 8)", "drive failed, anything else"],
             ["the operator", "hard-wired emergency stop"],
             PALE_RED,
         ),

@@ -60,7 +60,7 @@ _BEYOND_LINES = 1.0
 """Bandwidth over the highest excited frequency, from which a warning follows."""
 _EXPLAINED = {
     "P, I": "gains at the motor shaft, N·m·s/rad and N·m/rad",
-    "margins": "of the open loop: as believed, and the least over all corners of the intervals",
+    "margins": "of the open loop: best estimate, and the least over all corners of the intervals",
     "peak |S|": "greatest factor by which the loop enlarges a disturbance",
     "bandwidth": "frequency up to which the speed follows the set speed within 3 dB",
     "step": "small step of the set speed, without torque limit, ramp or setpoint filter; settled within 5 %",
@@ -289,7 +289,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     if document["tuned_for"]["present_from"] is not None:
         yield "present gains", document["tuned_for"]["present_from"]
     required = document["required"]
-    yield "margins asked for", f"{required['phase_deg']:g}° and {required['gain_db']:g} dB in the worst case"
+    yield "required margins", f"{required['phase_deg']:g}° and {required['gain_db']:g} dB in the worst case"
     if document["measured"]:
         off, hertz = document["measured"]["deviation_rel"], document["measured"]["hertz"]
         yield "measured response", (f"{len(hertz)} lines from {min(hertz):.3g} to {max(hertz):.3g} Hz; without the "
@@ -315,7 +315,7 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
         yield "notch: width, Hz; depth, dB", [_notch_shape(one["notch"]) for one in every]
     limits = document["required"]
     for name, key, digits, unit in (("phase margin", "phase_deg", 0, "°"), ("gain margin", "gain_db", 1, " dB")):
-        yield f"{name}, believed", [_margin(one["as_believed"], key, digits, unit) for one in every]
+        yield f"{name}, best estimate", [_margin(one["as_believed"], key, digits, unit) for one in every]
         yield f"{name}, worst", [
             ("!" if not one["worst"]["stable"] or (one["worst"][key] or math.inf) < limits[key] else "")
             + _margin(one["worst"], key, digits, unit) for one in every]
@@ -465,7 +465,7 @@ def loop_report(document: Part) -> Report:
         ReportSection("Gains and margins", (table, Pairs(tuple(_EXPLAINED.items())))),
         ReportSection("Open loop and sensitivity", (
             Picture("open_loop", partial(draw_loop, document=document), 5.2,
-                    "Lines: as believed. Bands: all corners of the intervals. Points: the measured shaft without the "
+                    "Lines: best estimate. Bands: all corners of the intervals. Points: the measured shaft without the "
                     "lags of the reports."),
         )),
         ReportSection("Step of the set speed", (

@@ -74,7 +74,7 @@ _EXPLAINED = {
     "|r|, mean": f"share of a wave that the top reflects (1: completely): at the lowest mode, and over "
                  f"{BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz",
     "damping": "damping ratio of the least damped of the lowest modes",
-    "J wrong": "damping and critical speed without noise if J is believed wrongly by as much",
+    "J wrong": "damping and critical speed without noise if J is wrong by as much",
 }
 _OF_SPEEDS = ("critical", "by ramp", "linear")
 

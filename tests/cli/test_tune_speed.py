@@ -76,6 +76,7 @@ def test_the_terminal_fits_80_columns_and_says_what_to_type(tuned):
     assert words.startswith("Type in P = ") and "The requested bandwidth is 0.8 Hz" in words
     assert "SIMULATED" in words and "as stated" in words and "TDH-056" not in words
     assert "25.02 Speed proportional gain" in words and "--rated-torque" in words
+    assert "required margins 45° and 8 dB" in words and "phase margin, best estimate" in words
     assert max(map(len, text.splitlines())) <= 80
 
 
