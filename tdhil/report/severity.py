@@ -103,11 +103,11 @@ def _sentence(records: Sequence[Part]) -> str:
                     f"rotation at {first['mean_rpm']:.0f} rpm.")
         if first["level"] == "at risk":
             return (f"No stick-slip in {minutes(first['turning_s'])} of rotation at {first['mean_rpm']:.0f} rpm, but "
-                    f"the downhole speed swings by ±{first['downhole_swing_rpm']['value']:.0f} rpm.")
+                    f"the downhole speed oscillates by ±{first['downhole_swing_rpm']['value']:.0f} rpm.")
         return f"No stick-slip in {minutes(first['turning_s'])} of rotation at {first['mean_rpm']:.0f} rpm."
     return (f"Severity index {first['severity_index']['value']:.2f} → {last['severity_index']['value']:.2f}, downhole "
-            f"swing ±{first['downhole_swing_rpm']['value']:.0f} → ±{last['downhole_swing_rpm']['value']:.0f} rpm, "
-            f"stick-slip {100.0 * first['stick_slip_share']:.0f} → {100.0 * last['stick_slip_share']:.0f} % of the "
+            f"oscillation ±{first['downhole_swing_rpm']['value']:.0f} → ±{last['downhole_swing_rpm']['value']:.0f} rpm,"
+            f" stick-slip {100.0 * first['stick_slip_share']:.0f} → {100.0 * last['stick_slip_share']:.0f} % of the "
             "time.")
 
 

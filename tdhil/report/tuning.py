@@ -58,16 +58,16 @@ and of the simulation's length (stiff loop of the reference case: 182 instead of
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
-    "cure": "lowest set speed from which a stuck bit ends turning, the top at full speed",
-    "start": "lowest set speed at which the bit turns after a ramp from rest",
+    "cure": "lowest set speed at which a stuck bit comes free and turns on, the top at full speed",
+    "start": "lowest set speed at which the bit turns after a ramp from standstill",
 }
 _EXPLAINED = {
     "P, I, J_c": "gains in N·m·s/rad, N·m/rad and kg·m², at the main shaft and at the motor shaft",
-    "critical": "lowest set speed from which a stuck bit, under bit noise, ends turning",
-    "by ramp": f"the same after a ramp of the set speed from rest, on {START_DRAWS} of the draws",
+    "critical": "lowest set speed at which a stuck bit comes free and turns on, with noise of the bit",
+    "by ramp": f"the same after a ramp of the set speed from standstill, on {START_DRAWS} of the draws",
     "linear": "mean speed below which steady rotation is unstable, without noise",
-    "phase margin": "phase that the loop with the string on it may lose; this and the next two: the least of all "
-                    "sampled machines and strings",
+    "phase margin": "phase that the loop with the string may lose; this and the next two: the least of all sampled "
+                    "machines and strings",
     "gain margin": "change of all gains that makes the loop unstable; 6 dB is a factor of 2",
     "dead time": "further dead time in the loop that makes it unstable",
     "a, φ": "softness and frequency factor: P = ζ/a, I = (φω)² (J − J_c)",

@@ -91,7 +91,8 @@ class Publisher:
     def __init__(self, broker: Broker, look: Callable[[], Mapping[str, Any]], say: Say = lambda text: None) -> None:
         if find_spec("paho") is None:
             raise UsageError("--mqtt needs paho-mqtt, not installed here",
-                             next_step="Install it in the clone of tdhil: pip install '.[mqtt]'", entry=MessageCode.PACKAGE_MISSING)
+                             next_step="Install it in the clone of tdhil: pip install '.[mqtt]'",
+                             entry=MessageCode.PACKAGE_MISSING)
         self._broker, self._look, self._say = broker, look, say
         self._published: dict[str, str] = {}
         self._connected, self._end = threading.Event(), threading.Event()

@@ -41,7 +41,8 @@ def require_service() -> None:
     missing = [name.replace("_", "-") for name in NEEDED if find_spec(name) is None]
     if missing:
         raise UsageError(f"the service needs {', '.join(missing)}, not installed here",
-                         next_step="Install it in the clone of tdhil: pip install '.[service]'", entry=MessageCode.PACKAGE_MISSING)
+                         next_step="Install it in the clone of tdhil: pip install '.[service]'",
+                         entry=MessageCode.PACKAGE_MISSING)
 
 
 @dataclass(frozen=True)

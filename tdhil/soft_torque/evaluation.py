@@ -131,8 +131,8 @@ def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
     if rate_hz < LOWEST_RATE_HZ * (1.0 - 1e-9) or quickest > MOST_CROSSOVER:
         needed = max(LOWEST_RATE_HZ, rate_hz * quickest / MOST_CROSSOVER)
         raise EvaluationRefused(
-            f"at {rate_hz:.3g} cycles a second the loop would swing by its cycle, not by the string",
-            where="--rate", next_step=f"This controller takes {needed:.3g} cycles a second or more")
+            f"{rate_hz:.3g} cycles a second are too few: the loop would oscillate with its cycle, not with the string",
+            where="--rate", next_step=f"This controller needs {needed:.3g} cycles a second or more")
     if case.own_loop and abs(case.scale * case.rig.gear_ratio - 1.0) > SAME_INERTIA:
         raise EvaluationRefused(
             f"the drive's own loop turns {case.rig.inertia_kg_m2 * case.rig.gear_ratio**2:.4g} kg·m² at the main shaft,"
@@ -168,7 +168,7 @@ def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
     room = window.highest_rad_s - float(highest[-1]) + cure.high * RPM * ratio
     if room < (cure.high + TOLERANCE_RPM) * RPM * ratio:
         raise EvaluationRefused(
-            f"the top swings up to {highest[-1]:.3g} rad/s at the motor where the bit begins to turn; the window ends "
+            f"the top reaches {highest[-1]:.3g} rad/s at the motor when the bit begins to turn; the window ends "
             f"at {window.highest_rad_s:.3g} rad/s", where="limits.speed_max_rad_s",
             next_step="Raise it, if machine and drive allow")
     friction = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * float(highest[-1])
@@ -199,7 +199,7 @@ def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) ->
             where="--use", next_step="Take a stiffer one; or tune for a heavier machine, with its own result, and name "
             "this rig's by --result: the string's torques are scaled to it")
     raise EvaluationRefused(
-        f"the top swings down to {lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm before the bit turns; this window "
+        f"the top falls to {lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm before the bit turns; this window "
         f"begins at {window.lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm",
         where="limits.speed_min_rad_s",
         next_step=f"Set it to {0.95 * lowest_rad_s:.2g} rad/s or less, or take a stiffer controller (--use)")

@@ -101,7 +101,7 @@ def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) ->
     largest = largest_stable_share(case, case.softness if case.softness is not None else 0.3, held)
     if asked is not None and asked > largest:
         raise TuningRefused(
-            f"{100 * asked:.0f} % of J compensated swings by itself if J is {_worst(case)}; at most "
+            f"{100 * asked:.0f} % of J compensated is unstable if J is {_worst(case)}; at most "
             f"{100 * largest:.0f} % is stable over J's interval behind {_lag_ms(case)} of lag{_no_drag(case)}",
             where=f"--compensate {asked:g}",
             next_step=f"Ask for {RESERVE * largest:.2f} or less, narrow J's interval, or find a shorter loop")
@@ -228,7 +228,7 @@ def _stable_everywhere(
 
 def _toosoft(case: TuneCase, softness: float, softest: float, held: Sequence[float]) -> str:
     return (f"a = {softness:.2g} is beyond ζ/(ω² J Στ) = {softest:.2g}: with {_lag_ms(case)} of lag in the loop and "
-            f"the string's lowest mode at {held[0]:.3g} Hz the drive would feed slow swings")
+            f"the string's lowest mode at {held[0]:.3g} Hz the drive would amplify slow oscillations")
 
 
 def _lag_ms(case: TuneCase) -> str:
@@ -237,4 +237,5 @@ def _lag_ms(case: TuneCase) -> str:
 
 def _worst(case: TuneCase) -> str:
     inertia = case.inertia_kg_m2
-    return f"{inertia.low:.4g} kg·m², the lower end of its interval, or {inertia.high:.4g} were believed, the upper"
+    return (f"{inertia.low:.4g} kg·m², the lower end of its interval, or the gains are for {inertia.high:.4g}, the"
+            " upper end")

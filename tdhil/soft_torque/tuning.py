@@ -73,7 +73,7 @@ def tune(
     """
     report("string's modes")
     held = string_modes_hz(case.string)
-    report("what is open: drawing truths")
+    report("machines and strings at random within their tolerances")
     samples = TruthMargins(case)
     simulated = search is not None and case.string.bit is not None
     found: list[Tuned] = []
@@ -83,7 +83,7 @@ def tune(
     report("soft, compensated: gains that keep the margins")
     pools = [soft(case, held, samples), compensated(case, held, samples)]
     if simulated:
-        report("the best of them, simulated under bit noise")
+        report("the best of these, simulated with noise of the bit")
         pools = best_by_simulation(pools, samples, held)
     found += [pool[0] for pool in pools]
     report("broadband: gains")
@@ -135,7 +135,7 @@ def noisy_cures(
 def _under_noise(
     found: list[Tuned], samples: TruthMargins, held: Sequence[float], report: Callable[[str], None]
 ) -> list[Tuned]:
-    report("critical speeds under bit noise, simulated on every truth")
+    report("critical speeds with noise of the bit, simulated on every draw")
     taken = [one for one in found if one.controller is not None]
     laws = [None if one.kind == "present" else one.controller for one in taken]
     cures = noisy_cures(samples.truths, laws, held)
@@ -191,7 +191,7 @@ def _without_noise(
     case: TuneCase, every: tuple[Tuned, ...], held: Sequence[float], search: Search, report: Callable[[str], None]
 ) -> tuple[Tuned, ...]:
     """Return the rows with cure speeds of the stated string: over J and each other interval, and for a wrong J."""
-    report("critical speeds without noise, and what a wrong J costs")
+    report("critical speeds without noise, and with a wrong J")
     inertia = case.inertia_kg_m2
     loops: list[tuple[DrillString, TopDrive, SpeedController]] = []
     sizes = []

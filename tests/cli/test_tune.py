@@ -81,7 +81,7 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     code, text, _ = tuned("--inner-lags", "20ms", "10ms", "3ms", "--profile", "abb/acs880-enhanced", as_json=False)
     assert code == 0
     words = " ".join(text.split())
-    assert "SIMULATED" in words
+    assert "SIMULATED" in words and "comes free and turns on" in words
     assert "20 + 10 + 3 ms, as stated" in words
     assert "static 5000 N·m" in words
     assert "broadband refused" in words
@@ -90,7 +90,7 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
 
 
 @pytest.mark.parametrize(("words", "said", "code", "message"), [
-    (("--compensate", "80%"), {}, 11, "swings by itself"),
+    (("--compensate", "80%"), {}, 11, "is unstable"),
     (("--loop", "bus", "--a", "1.5"), {}, 11, "is beyond ζ/(ω² J Στ)"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable"}, 11, "no J to tune for (not_identifiable)"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable", "impedance": {"verdict": "valid"}}, 11,

@@ -194,7 +194,7 @@ def test_softer_than_the_lags_allow_is_refused_with_its_numbers():
 @pytest.mark.heavy
 def test_more_compensation_than_the_interval_allows_is_refused_with_its_numbers():
     wide = Interval(1500.0, 850.0, 2640.0)
-    with pytest.raises(TuningRefused, match=r"50 % of J compensated swings by itself if J is 850.*33 ms of lag"):
+    with pytest.raises(TuningRefused, match=r"50 % of J compensated is unstable if J is 850.*33 ms of lag"):
         tune(case(wide, compensated_share=0.5), search=None)
     tune(case(compensated_share=0.5, required=NO_MARGINS), search=None)      # accepted if the interval of J is narrow
 
