@@ -150,8 +150,17 @@ def can_line(cli: Mapping[str, Any], rig: Rig | None = None) -> CanLine:
     Raises UsageError and DataFileError for an unusable value. A file or variable that names a bit rate but no
     interface leaves the bus unconfigured.
     """
-    settings: dict[str, Setting] = {}
-    for source in (_from_cli(cli), _from_rig(rig), _from_environment(), _from_files()):
+    settings = {name: Setting.by_flag(cli[name], flag) for name, flag in _FLAGS.items() if cli.get(name) is not None}
+    for name, value in (cli.get("bus_kwargs") or {}).items():
+        settings.setdefault(name, Setting.by_flag(value, "--bus-kwargs"))
+    if rig is not None:
+        section = CANOPEN.section_of(rig)
+        for name in ("interface", "channel", "bitrate"):
+            if (value := getattr(section, name)) is not None:
+                settings.setdefault(name, Setting.by_rig(value, rig, f"bus.{name}"))
+        for name, value in section.options.items():
+            settings.setdefault(name, Setting.by_rig(value, rig, f"bus.options.{name}"))
+    for source in (_from_environment(), _from_files()):
         for name, setting in source.items():
             settings.setdefault(name, setting)
     if "interface" in settings and not settings["interface"].value:
@@ -160,26 +169,6 @@ def can_line(cli: Mapping[str, Any], rig: Rig | None = None) -> CanLine:
     first = [name for name in ("interface", "channel", "bitrate") if name in settings]
     ordered = {name: settings[name] for name in (*first, *(name for name in settings if name not in first))}
     return CanLine(MappingProxyType(ordered))
-
-
-def _from_cli(cli: Mapping[str, Any]) -> dict[str, Setting]:
-    found = {name: Setting.by_flag(cli[name], flag) for name, flag in _FLAGS.items() if cli.get(name) is not None}
-    for name, value in (cli.get("bus_kwargs") or {}).items():
-        found.setdefault(name, Setting.by_flag(value, "--bus-kwargs"))
-    return found
-
-
-def _from_rig(rig: Rig | None) -> dict[str, Setting]:
-    if rig is None:
-        return {}
-    found = {}
-    section = CANOPEN.section_of(rig)
-    for name in ("interface", "channel", "bitrate"):
-        if (value := getattr(section, name)) is not None:
-            found[name] = Setting.by_rig(value, rig, f"bus.{name}")
-    for name, value in section.options.items():
-        found.setdefault(name, Setting.by_rig(value, rig, f"bus.options.{name}"))
-    return found
 
 
 def _from_environment() -> dict[str, Setting]:
@@ -375,7 +364,11 @@ def _probe_server(arguments: dict[str, Any]) -> None:
     host, port = str(arguments["host"]), arguments["port"]
     try:
         with socket.create_connection((host, port), timeout=PROBE_S) as probe:
-            greeting = _greeting(probe)
+            greeting = b""      # as far as it arrives in time
+            probe.settimeout(PROBE_S)
+            with contextlib.suppress(TimeoutError):
+                while len(greeting) < len(_GREETING) and (more := probe.recv(len(_GREETING) - len(greeting))):
+                    greeting += more
     except (OSError, OverflowError, UnicodeError) as error:
         raise CommunicationLost(
             f"no socketcand server answers ({error})",
@@ -389,16 +382,6 @@ def _probe_server(arguments: dict[str, Any]) -> None:
             next_step="Check host and port",
             entry=MessageCode.SERVER_UNREACHABLE,
         )
-
-
-def _greeting(probe: socket.socket) -> bytes:
-    """Return the server's greeting, as far as it arrives in time."""
-    found = b""
-    probe.settimeout(PROBE_S)
-    with contextlib.suppress(TimeoutError):
-        while len(found) < len(_GREETING) and (more := probe.recv(len(_GREETING) - len(found))):
-            found += more
-    return found
 
 
 def _explained(config: CanLine, error: Exception) -> Exception:

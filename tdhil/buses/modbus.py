@@ -32,7 +32,7 @@ from drivers import (
 )
 from drivers import modbus as driver
 from profiles import DataModel, Finding, Profile, ProfileEntry, load_profile, profile_names
-from profiles.modbus import BusLine, ModbusFilter, ModbusProfile, Parameter, Register
+from profiles.modbus import BusLine, ModbusProfile, Parameter, Register
 from tdhil.buses.bus import Bus, Connection, FoundDrive, Line, Opening, PeerPlan, ProfileTable, ValueSeen, one_host
 from tdhil.buses.doctor_finding import DoctorFinding, attempted, bad, note, of_check, of_error, ok
 from tdhil.buses.profile_text import MARKS, unit_text, watchdog_text
@@ -409,16 +409,15 @@ def _profile_tables(profile: ModbusProfile) -> Iterator[ProfileTable]:
     if not profile.filters:
         yield ProfileTable(remarks=("This profile names no filter on the reported signals.",))
         return
-    filters = tuple((one.signal, _filter_text(profile, one), one.advice or "") for one in profile.filters)
+    filters = tuple((
+        one.signal,
+        f"{one.documented_s:g} s, as documented" if one.parameter is None
+        else f"read from {profile.parameter(one.parameter).title}",
+        one.advice or "",
+    ) for one in profile.filters)
     notes = tuple(f"  {name}: {note}" for name in ("speed", "torque") if (note := getattr(profile.cycle, name).note))
     yield ProfileTable("filters on the reported signals",
                        ("signal", "time constant", "to change for a better result"), filters, notes)
-
-
-def _filter_text(profile: ModbusProfile, one: ModbusFilter) -> str:
-    if one.parameter is None:
-        return f"{one.documented_s:g} s, as documented"
-    return f"read from {profile.parameter(one.parameter).title}"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -460,7 +459,9 @@ def identify(link: driver.Link, unit: int, transport: str, line: dict[str, Any])
     simulated = False
     with contextlib.suppress(CommunicationLost):
         simulated = driver.read_marker(plain).simulated
-    fits = [fit for profile in _profiles(transport) if (fit := _fit(link, unit, profile, vendor)) is not None]
+    known = [one for name in profile_names() if isinstance(one := load_profile(name), ModbusProfile)]
+    fits = [fit for one in known
+            if transport in one.line.transports and (fit := _fit(link, unit, one, vendor)) is not None]
     profile, why = choose(fits)
     return FoundDrive("modbus", unit, product or vendor or "Modbus device", said or "unknown (function 43)", simulated,
                       profile, why, line=line)
@@ -481,31 +482,22 @@ def choose(fits: Sequence[ProfileFit]) -> tuple[str | None, str]:
     return None, "no profile fits, all have registers without an answer: copy profiles/generic/modbus.yaml and adapt it"
 
 
-def _profiles(transport: str) -> list[ModbusProfile]:
-    found = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
-    return [profile for profile in found if transport in profile.line.transports]
-
-
 def _fit(link: driver.Link, unit: int, profile: ModbusProfile, vendor: str) -> ProfileFit | None:
     """Return the fit; None if one of the profile's registers can't be read."""
     counts: dict[str, int] = {}
     access = driver.RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
     for use in register_uses(profile):
-        try:
-            raw = _read_once(access, use.register, profile)
+        register = use.register
+        function = driver.READ_HOLDING if register.table == "holding" else driver.READ_INPUT
+        try:      # without the retries of a preflight: a scan reads many registers that do not exist
+            words = access.once(driver.read(function, register.address, register.count), driver.ANSWER_S).words
+            raw = driver.from_words(words, register.type, profile.line.word_order)
         except (CommunicationLost, PreflightRefused):
             return None
         if use.name.startswith("parameters."):
             counts[use.name.partition(".")[2]] = raw
     maker = profile.name.partition("/")[0]
     return ProfileFit(profile.name, _plate(profile, counts), bool(vendor) and maker in vendor.lower())
-
-
-def _read_once(access: driver.RegisterAccess, register: Register, profile: ModbusProfile) -> int:
-    """Read once, without the retries of a preflight: a scan reads many registers that do not exist."""
-    function = driver.READ_HOLDING if register.table == "holding" else driver.READ_INPUT
-    words = access.once(driver.read(function, register.address, register.count), driver.ANSWER_S).words
-    return driver.from_words(words, register.type, profile.line.word_order)
 
 
 def _plate(profile: ModbusProfile, counts: dict[str, int]) -> bool | None:

@@ -105,18 +105,15 @@ def _facts(model: BaseModel, prefix: str) -> Iterator[tuple[str, str, str]]:
             yield from _facts(value, f"{key}.")
         elif isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
             for number, one in enumerate(value, start=1):
-                yield f"{key} {number}", _flat(one), field.description or ""
+                parts = [(inner.alias or part, getattr(one, part)) for part, inner in type(one).model_fields.items()]
+                text = ", ".join(f"{part} {_value(part, value)}" for part, value in parts if value is not None)
+                yield f"{key} {number}", text, field.description or ""
         else:
             yield key, _value(name, value), field.description or ""
 
 
 def _entries(value: Any) -> bool:
     return isinstance(value, tuple) and bool(value) and isinstance(value[0], ProfileEntry)
-
-
-def _flat(model: BaseModel) -> str:
-    shown = [(field.alias or name, getattr(model, name)) for name, field in type(model).model_fields.items()]
-    return ", ".join(f"{name} {_value(name, value)}" for name, value in shown if value is not None)
 
 
 _HEX = {"mask", "value", "onward", "off", "quick_stop", "fault_reset", "speed_bits", "torque_bits", "reverse_bits",

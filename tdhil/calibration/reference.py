@@ -192,6 +192,8 @@ def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, fl
 
     Searches every offset with an overlap of at least half of the shorter record and `LEAST_OVERLAP_S`.
     """
+    from scipy.signal import fftconvolve
+
     width = max(_COARSE_S, 2.0 * _slowest(drive), 2.0 * _slowest(sensor))
     step = width / _PER_WIDTH
     x, y = (_averaged(one, _grid(one.time_s[0], one.time_s[-1], step), width) for one in (drive, sensor))
@@ -202,7 +204,8 @@ def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, fl
     ones_x, ones_y = known_x.astype(np.float64), known_y.astype(np.float64)
     for name, a, b in (("n", ones_x, ones_y), ("x", x, ones_y), ("y", ones_x, y), ("xx", x * x, ones_y),
                        ("yy", ones_x, y * y), ("xy", x, y)):
-        products[name] = _correlated(a, b)
+        # Σ_t a(t) b(t + lag) for lags from −(len(a) − 1) to len(b) − 1
+        products[name] = np.asarray(fftconvolve(b, a[::-1]), dtype=np.float64)
     n = products["n"]
     least = max(LEAST_OVERLAP_S / step, 0.5 * min(len(x), len(y)))
     enough = n >= min(least, float(n.max()))
@@ -217,13 +220,6 @@ def _coarse_offset(drive: TorqueRecord, sensor: TorqueRecord) -> tuple[float, fl
         best = opposite
     lag = best - (len(x) - 1)
     return float(sensor.time_s[0] - drive.time_s[0] + lag * step), float(r[best])
-
-
-def _correlated(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return Σ_t a(t) b(t + lag) for lags from −(len(a) − 1) to len(b) − 1."""
-    from scipy.signal import fftconvolve
-
-    return np.asarray(fftconvolve(b, a[::-1]), dtype=np.float64)
 
 
 def _slowest(one: TorqueRecord) -> float:

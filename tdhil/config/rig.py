@@ -11,7 +11,7 @@ shaft. It is frozen, and has the file and line of each key::
       …
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -202,18 +202,12 @@ class Expected(DataModel):
     load_noise_nm: Torque | None = Field(default=None, description="N·m; standard deviation of the disturbing torque")
 
 
-def _only_the_operator() -> Iterator[tuple[str, str]]:
-    for one in OPTIONS:
-        if one.group is Topic.OVERRIDES and not one.at:
-            flag = f"{one.flag} NAME" if one.joined else one.flag
-            text = (f"belongs to one run, never to a file; remove the line and give {flag} on the "
-                    "command line")
-            yield one.name, text
-            if one.joined:
-                yield f"{one.name}s", text
-
-
-_ONLY_THE_OPERATOR = dict(_only_the_operator())
+_ONLY_THE_OPERATOR = {
+    name: f"belongs to one run, never to a file; remove the line and give {one.flag}{' NAME' if one.joined else ''} on "
+          "the command line"
+    for one in OPTIONS if one.group is Topic.OVERRIDES and not one.at
+    for name in ((one.name, f"{one.name}s") if one.joined else (one.name,))
+}
 
 
 def attribute_of(key: str) -> str:
@@ -306,7 +300,12 @@ class Rig(_Options):
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
         """Return errors: missing keys of a string, and limits that contradict other keys."""
         asked = values.get("acceptance")
-        wrong = list(_wrong_expectations(asked)) if isinstance(asked, Mapping) else []
+        wrong: list[Finding] = []
+        for name, text in asked.items() if isinstance(asked, Mapping) else ():
+            try:
+                Expectation.of(str(name), str(text))
+            except ValueError as error:
+                wrong.append((f"acceptance.{name}", str(error)))
         load = _load_of(values.get("load"))
         is_string = isinstance(load, Mapping) and load.get("kind") == "string"
         findings = [
@@ -356,14 +355,6 @@ class Rig(_Options):
     def folder(self) -> Path:
         """Folder in which relative paths of rig.yaml start."""
         return Path(self._file).parent
-
-
-def _wrong_expectations(asked: Mapping[str, Any]) -> Iterator[Finding]:
-    for name, text in asked.items():
-        try:
-            Expectation.of(str(name), str(text))
-        except ValueError as error:
-            yield f"acceptance.{name}", str(error)
 
 
 def rig_model() -> type[Rig]:

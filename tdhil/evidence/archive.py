@@ -91,7 +91,9 @@ def members_of(facts: LogFacts, log: bytes, statement: PublisherStatement, resul
         README: "",
         STATEMENT: text_of(statement.plain()),
         IDENTITY: text_of(identity | {"firmware": statement.firmware or reported}),
-        PARAMETERS: text_of([_parameter(one) for one in facts.preflight]),
+        PARAMETERS: text_of([        # each line of preflight in its parts
+            {name: part for name, part in check.groupdict().items() if part} if (check := _CHECK.fullmatch(one))
+            else {"text": one} for one in facts.preflight]),
         PROFILE: text_of(facts.run.get("profile")),
         RESULT: text_of(result),
     }
@@ -111,12 +113,6 @@ def _reported_firmware(facts: LogFacts) -> str:
     """Return the software version that the drive reported (100Ah); '' for none, and for a log of an earlier version."""
     found = dict(facts.run.get("identity") or {}).get("firmware")
     return found if isinstance(found, str) else ""
-
-
-def _firmware(facts: LogFacts, statement: PublisherStatement) -> str:
-    reported = _reported_firmware(facts)
-    stated = statement.firmware or ("" if reported else "not stated")
-    return "; ".join(filter(None, (stated, f"the drive reports {reported} (100Ah)" if reported else "")))
 
 
 def archive_of(members: Mapping[str, bytes]) -> bytes:
@@ -177,14 +173,6 @@ def text_of(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, indent=1) + "\n"
 
 
-def _parameter(text: str) -> dict[str, str]:
-    """Return one line of preflight in its parts."""
-    found = _CHECK.fullmatch(text)
-    if found is None:
-        return {"text": text}
-    return {name: part for name, part in found.groupdict().items() if part}
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -194,19 +182,22 @@ def readme(facts: LogFacts, statement: PublisherStatement, result: Mapping[str, 
     identity, profile = (dict(facts.run.get(name) or {}) for name in ("identity", "profile"))
     permitted = ", ".join(statement.publish)
     kept = ", ".join(one for one in PARTS if one not in statement.publish) or "none"
+    reported, agreement = _reported_firmware(facts), agreement_of(statement, result)
+    stated = statement.firmware or ("" if reported else "not stated")
+    firmware = "; ".join(filter(None, (stated, f"the drive reports {reported} (100Ah)" if reported else "")))
     lines = [
         f"{SIMULATED}: this run is of the simulated drive of tdhil. It is no evidence about a drive.\n"
         if facts.simulated else "This run is of a real drive.\n",
         "An archive of tdhil: one run that identified a moment of inertia, with all that is needed to check it.\n",
         f"drive            {identity.get('name', '')}, vendor {identity.get('vendor')}, product"
         f" {identity.get('product')}, revision {identity.get('revision')}",
-        f"firmware         {_firmware(facts, statement)}",
+        f"firmware         {firmware}",
         f"profile          {profile.get('name', '')}: {profile.get('title', '')}",
         f"date             {facts.run.get('started') or 'not stated'}",
         f"J                {_inertia(result)}",
         f"verdict          {result.get('verdict')}",
         f"reference        {_reference(statement)}",
-        f"agreement        {_agreement(statement, result)}",
+        f"agreement        {'not known: no reference, or no J' if agreement is None else agreement.text}",
         f"entries shown    {', '.join(shown) or 'none'}",
         "",
         f"publisher        {statement.publisher}",
@@ -242,8 +233,3 @@ def _reference(statement: PublisherStatement) -> str:
         return "none stated"
     return (f"{one.inertia_kg_m2:.6g} kg m2, standard uncertainty {one.sd_kg_m2:.3g} kg m2, {one.method}:"
             f" {one.note}")
-
-
-def _agreement(statement: PublisherStatement, result: Mapping[str, Any]) -> str:
-    found = agreement_of(statement, result)
-    return "not known: no reference, or no J" if found is None else found.text

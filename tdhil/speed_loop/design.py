@@ -266,7 +266,16 @@ def design_speed_loop(case: SpeedLoopCase) -> LoopDesign:
             next_step="Identify again for narrower intervals, state the lags better, or accept thinner margins "
                       "with --phase-margin and --gain-margin")
     if case.bandwidth_hz is not None:
-        found = _requested(search, found, case.bandwidth_hz)
+        hertz, largest = case.bandwidth_hz, found
+        found = search.with_bandwidth(hertz, largest.notch)
+        if not search.fits(found):
+            worst = worst_of(search.margins(found))
+            what = ("the loop is unstable or conditionally stable at a corner of the intervals" if not worst.stable
+                    or worst.conditional else f"the worst case has {worst.phase_deg:.0f}° and {worst.gain_db:.1f} dB")
+            raise LoopTuningRefused(
+                f"a bandwidth of {hertz:g} Hz leaves too little margin: {what} (limits {case.phase_deg:g}° and "
+                f"{case.gain_db:g} dB). The largest bandwidth that fits is {search.bandwidth_hz(largest):.3g} Hz",
+                next_step=f"Request --bandwidth {search.bandwidth_hz(largest):.2g} or less")
     if not all(is_stable_loop(plant, found) for plant in (search.believed, *search.corners)):
         raise LoopTuningRefused("the poles of the tuned loop contradict its margins",
                                 next_step="Request a lower --bandwidth")
@@ -282,20 +291,6 @@ def _best(search: _GainSearch, plain: PiGains | None, without_hz: float | None) 
         return plain
     hertz, gains = max(offered, key=lambda one: one[0])
     return gains if without_hz is None or hertz >= NOTCH_GAIN * without_hz else plain
-
-
-def _requested(search: _GainSearch, largest: PiGains, hertz: float) -> PiGains:
-    case = search.case
-    found = search.with_bandwidth(hertz, largest.notch)
-    if search.fits(found):
-        return found
-    worst = worst_of(search.margins(found))
-    what = ("the loop is unstable or conditionally stable at a corner of the intervals" if not worst.stable
-            or worst.conditional else f"the worst case has {worst.phase_deg:.0f}° and {worst.gain_db:.1f} dB")
-    raise LoopTuningRefused(
-        f"a bandwidth of {hertz:g} Hz leaves too little margin: {what} (limits {case.phase_deg:g}° and "
-        f"{case.gain_db:g} dB). The largest bandwidth that fits is {search.bandwidth_hz(largest):.3g} Hz",
-        next_step=f"Request --bandwidth {search.bandwidth_hz(largest):.2g} or less")
 
 
 def worst_of(margins: tuple[SpeedLoopMargins, ...]) -> SpeedLoopMargins:

@@ -56,11 +56,8 @@ def loop_curve(design: LoopDesign, gains: PiGains, lowest_hz: float | None = Non
     loops = np.array([loop_response(plant, gains, 2.0 * pi * hertz) for plant in plants])
     phase = np.degrees(np.unwrap(np.angle(loops), axis=1))
     phase -= 360.0 * np.round((phase[:, :1] + 135.0) / 360.0)
-    return LoopCurve(hertz, *(_banded(part) for part in (np.abs(loops), phase, np.abs(1.0 / (1.0 + loops)))))
-
-
-def _banded(values: Reals) -> tuple[Reals, Reals, Reals]:
-    return values[0], values.min(axis=0), values.max(axis=0)
+    parts = (np.abs(loops), phase, np.abs(1.0 / (1.0 + loops)))
+    return LoopCurve(hertz, *((part[0], part.min(axis=0), part.max(axis=0)) for part in parts))
 
 
 def measured_shaft(

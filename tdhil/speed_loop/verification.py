@@ -240,8 +240,11 @@ class _LoopModel:
         a, b, c = closed_loop(plant, gains)
         lag_s = max(0.0, _shifted(self.case.reported_lag_s, REPORT_WIDER * float(theta[5])))
         for tau in (lag_s, self._reference_filter_s):
-            if tau > 0.0:
-                a, b, c = _behind(a, b, c, tau)
+            if tau > 0.0:      # a first-order lag at the output
+                size = len(a)
+                joined = np.zeros((size + 1, size + 1))
+                joined[:size, :size], joined[size, :size], joined[size, size] = a, c / tau, -1.0 / tau
+                a, b, c = joined, np.append(b, 0.0), np.append(np.zeros(size), 1.0)
         delay_s = max(0.0, self._delay_s[0] + self._delay_s[1] * float(theta[6]))
         size, length = len(a), self.count + self._apart
         whole = np.zeros((size + 1, size + 1))
@@ -270,14 +273,6 @@ def _moved(part: Range, by: float) -> float:
 
 def _shifted(part: Range, by: float) -> float:
     return part.value + (part.high - part.low) / (2.0 * NORMAL_95) * by
-
-
-def _behind(a: Reals, b: Reals, c: Reals, tau_s: float) -> tuple[Reals, Reals, Reals]:
-    """Return the system (A, B, C) with a first-order lag at its output."""
-    size = len(a)
-    joined = np.zeros((size + 1, size + 1))
-    joined[:size, :size], joined[size, :size], joined[size, size] = a, c / tau_s, -1.0 / tau_s
-    return joined, np.append(b, 0.0), np.append(np.zeros(size), 1.0)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -323,7 +318,12 @@ def verify_steps(
     covariance = moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
     fitted = model.reported(theta)
     misfit = mean - fitted
-    rms, chance = float(np.sqrt(np.mean(misfit**2))), _chance(scatter, slopes, inverse, sd, misfit)
+    rms = float(np.sqrt(np.mean(misfit**2)))
+    # probability that noise alone gives this misfit, from random signs of the pairs' scatter
+    signs = np.random.default_rng(0).choice((-1.0, 1.0), (_SHUFFLES, number))
+    noise = signs @ scatter / sqrt(number * (number - 1))
+    left = noise - noise @ slopes @ inverse @ slopes.T / sd**2
+    chance = float(np.mean((left**2).sum(axis=1) >= float((misfit**2).sum())))
     rows = _rows(model, theta, covariance, number)
     outcome, reason = _judged(rows, rms, chance, limited=limited)
     return StepVerification(outcome, reason, rows, number, rms, chance, time_s, mean, fitted, expected)
@@ -366,16 +366,6 @@ def _slopes(model: _LoopModel, theta: Reals, now: Reals) -> Reals:
         moved[k] += step
         columns.append((model.reported(moved) - now) / step)
     return np.array(columns).T
-
-
-def _chance(scatter: Reals, slopes: Reals, inverse: Reals, sd: float, misfit: Reals) -> float:
-    """Return the probability that noise alone gives this misfit, from random signs of the pairs' scatter."""
-    number = len(scatter)
-    rng = np.random.default_rng(0)
-    signs = rng.choice((-1.0, 1.0), (_SHUFFLES, number))
-    noise = signs @ scatter / sqrt(number * (number - 1))
-    left = noise - noise @ slopes @ inverse @ slopes.T / sd**2
-    return float(np.mean((left**2).sum(axis=1) >= float((misfit**2).sum())))
 
 
 def _rows(model: _LoopModel, theta: Reals, covariance: Reals, number: int) -> tuple[StepRow, ...]:
@@ -436,7 +426,9 @@ def _judged(rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bo
         said = [_WORDS[row.name] + (f" is {row.measured.value / row.predicted.value:.2f} times the typed value"
                                     if row in gains else " is outside its predicted interval") for row in off]
         return StepOutcome.DIFFERS, "; ".join(said)
-    open_by = [row for row in gains if not _is_sharp(row)]
+    # gains whose interval does not exclude an error of `LIKE_SHARE`
+    open_by = [row for row in gains if not (row.measured.low / row.predicted.value > 1.0 - LIKE_SHARE
+                                            and row.measured.high / row.predicted.value < 1.0 + LIKE_SHARE)]
     if open_by:
         wide = open_by[0]
         return StepOutcome.CANNOT_TELL, (
@@ -444,9 +436,3 @@ def _judged(rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bo
             f"{wide.measured.high / wide.predicted.value:.2f} times the typed value: an error of "
             f"{100 * LIKE_SHARE:.0f} % would not be seen")
     return StepOutcome.AGREES, "all measured intervals meet the predicted ones"
-
-
-def _is_sharp(row: StepRow) -> bool:
-    """Return whether the interval of a gain excludes an error of `LIKE_SHARE`."""
-    ratio = row.measured.low / row.predicted.value, row.measured.high / row.predicted.value
-    return ratio[0] > 1.0 - LIKE_SHARE and ratio[1] < 1.0 + LIKE_SHARE

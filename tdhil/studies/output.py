@@ -120,7 +120,12 @@ class Written:
 def write_study(outcome: StudyOutcome, settings: BaseModel, folder: Path) -> Written:
     """Write into ``folder``, created if needed. Files of the same names are replaced."""
     folder.mkdir(parents=True, exist_ok=True)
-    tables = tuple(_csv(table, folder) for table in outcome.tables)
+    tables = tuple(folder / f"{table.name}.csv" for table in outcome.tables)
+    for table, path in zip(outcome.tables, tables, strict=True):
+        with path.open("w", encoding="utf-8", newline="") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(table.columns)
+            rows.writerows([_cell(value) for value in row] for row in table.rows)
     own = _settings(outcome.name, settings, folder)
     if outcome.draw is None:
         return Written(folder, tables, own)
@@ -153,15 +158,6 @@ def document(outcome: StudyOutcome, settings: BaseModel, written: Written) -> di
     plain = _plain(whole)
     assert isinstance(plain, dict)
     return plain
-
-
-def _csv(table: ResultTable, folder: Path) -> Path:
-    path = folder / f"{table.name}.csv"
-    with path.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(table.columns)
-        rows.writerows([_cell(value) for value in row] for row in table.rows)
-    return path
 
 
 def _cell(value: Cell) -> str:

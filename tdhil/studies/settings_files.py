@@ -61,9 +61,15 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
             raise UsageError(f"--set {assignment}: must be name=value", next_step="For example --set Kp=3000",
                              entry=MessageCode.STUDY_SETTING_WRONG)
         *sections, last = name.split(".")
-        field = last if sections else _field(name, settings)
-        if not sections:
-            _refuse_varied(settings, field, assignment)
+        fields = type(settings).model_fields      # the model refuses an unknown name
+        named = (one for one in (name, full_name(name), name.lower()) if one in fields)
+        field = last if sections else next(named, name)
+        if not sections and field in getattr(settings, "varied", ()):     # the value would have no effect
+            raise UsageError(
+                f"--set {assignment}: {field} is what this study varies from run to run",
+                next_step="Change its levels: 'factors' of a design, 'values' of a sweep",
+                entry=MessageCode.STUDY_SETTING_WRONG,
+            )
         tree = read_tree(f"value: {text}", "--set")
         if tree.problems or not isinstance(tree.data, dict) or list(tree.data) != ["value"]:
             why = tree.problems[0].message if tree.problems else "must be one value"
@@ -84,19 +90,3 @@ def with_assignments(settings: M, assignments: Iterable[str]) -> M:
         ]
         raise UsageError("--set " + "; ".join(problems), next_step=f"Symbols: {', '.join(SYMBOLS)}",
                          entry=MessageCode.STUDY_SETTING_WRONG) from None
-
-
-def _field(name: str, settings: BaseModel) -> str:
-    """Return the field for a name; an unknown name is returned unchanged, and the model refuses it."""
-    fields = type(settings).model_fields
-    return next((one for one in (name, full_name(name), name.lower()) if one in fields), name)
-
-
-def _refuse_varied(settings: BaseModel, field: str, assignment: str) -> None:
-    """Refuse one value for a setting that varies between runs: its levels apply, and the value would have no effect."""
-    if field in getattr(settings, "varied", ()):
-        raise UsageError(
-            f"--set {assignment}: {field} is what this study varies from run to run",
-            next_step="Change its levels: 'factors' of a design, 'values' of a sweep",
-            entry=MessageCode.STUDY_SETTING_WRONG,
-        )

@@ -59,7 +59,12 @@ def plan_for(plant: CoveragePlant, guess: RigGuess, periods: int) -> Plan:
 def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> SimulatedMotion:
     """Return every run's reference on the same grid, which depends only on the plant, not on the other runs."""
     plans = [plan_for(plant, guess, periods) for guess in guesses]
-    join = _join_s(plant, periods)
+    # duration of the transition, s: the longest for the most wrong rough guesses, plus a tenth
+    longest = 0.0
+    for corner in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)):
+        rough = plan_for(plant, rough_guess(plant, np.array(corner)), periods)
+        longest = max(longest, rough.transition(rough.segments[0].reference.start_speed_rad_s, 1).duration_s)
+    join = math.ceil(11.0 * longest) / 10.0
     length = plans[0].segments[0].duration_s
     starts = (_LEAD_S, _LEAD_S + length + join)
     steps = round((starts[1] + length + _TAIL_S) / plant.step_s)
@@ -73,15 +78,6 @@ def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> Simul
         tuple(segment.recorded(start) for segment, start in zip(plan.segments, starts, strict=True)) for plan in plans
     )
     return SimulatedMotion(target, feed, segments, np.array([guess.inertia_kg_m2 for guess in guesses]), plant.step_s)
-
-
-def _join_s(plant: CoveragePlant, periods: int) -> float:
-    """Return the duration of the transition, s: the longest for the most wrong rough guesses, plus a tenth."""
-    longest = 0.0
-    for corner in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)):
-        plan = plan_for(plant, rough_guess(plant, np.array(corner)), periods)
-        longest = max(longest, plan.transition(plan.segments[0].reference.start_speed_rad_s, 1).duration_s)
-    return math.ceil(11.0 * longest) / 10.0
 
 
 def _one(
@@ -367,16 +363,14 @@ def _head(run: SimulatedRun) -> tuple[str, int, float, str, str]:
 
 
 def run_all(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
-    """Yield groups when they are done, in no particular order. An interruption drops unfinished groups."""
-    if processes <= 1:
-        return map(run_task, wanted)
-    return _by_several(wanted, processes)
+    """Yield groups when they are done, in no particular order. An interruption drops unfinished groups.
 
-
-def _by_several(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
-    """Run the tasks in several processes. Raises TdhilError if a process died with a task: the benchmark is then
-    incomplete.
+    Raises TdhilError if one of several processes died with a task: the benchmark is then incomplete.
     """
+    if processes <= 1:
+        yield from map(run_task, wanted)
+        return
+
     with Pool(run_task, min(processes, len(wanted)), TaskLimits(None, None)) as pool:
         for task, result in pool.run(wanted):
             if isinstance(result, Loss):

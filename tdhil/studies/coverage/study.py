@@ -398,7 +398,7 @@ class CoverageStudy:
                 done += len(group)
                 left_s = (time.monotonic() - begun_s) * (total - done) / done
                 of_plant = f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs"
-                left = _duration_words(left_s)
+                left = f"{left_s / 60.0:.0f} min" if left_s >= 90.0 else f"{left_s:.0f} s"
                 progress(0.98 * done / total, f"{of_plant}; {done} of {total} in all, about {left} left")
         except KeyboardInterrupt:
             done = sum(map(len, runs.values()))     # Ctrl-C may have come between the two
@@ -413,10 +413,6 @@ class CoverageStudy:
         progress(1.0, "interrupted" if interrupted else "done")
         outcome = outcome_of(self, found, settings)
         return cut_short(outcome, done, total) if interrupted else outcome
-
-
-def _duration_words(duration_s: float) -> str:
-    return f"{duration_s / 60.0:.0f} min" if duration_s >= 90.0 else f"{duration_s:.0f} s"
 
 
 def cut_short(outcome: StudyOutcome, done: int, total: int) -> StudyOutcome:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import model_validator
 
 from profiles import refuse_if
-from tdhil.studies.paper.design_runs import DesignResult, DesignRun, OverDesign
+from tdhil.studies.paper.design_runs import DesignResult, OverDesign
 from tdhil.studies.paper.loop import LABELS, LoopRecord, LoopSettings, Positive, SamplePeriod, changed, simulate
 from tdhil.studies.paper.orthogonal_design import DesignSettings
 from tdhil.studies.paper.processing import response, torque_line
@@ -22,7 +22,6 @@ from tdhil.studies.paper.tables import effect_document, effect_table, published_
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -86,22 +85,20 @@ def draw_scatter(figure: Figure, result: DesignResult) -> None:
         if index >= count:
             axes.set_axis_off()
             continue
-        _panel(axes, index + 1, result.runs[index])
+        run = result.runs[index]
+        axes.plot(run.alpha_rad_s2, run.torque_nm, ".", color="C0", ms=2, rasterized=True)
+        ends = np.array([run.alpha_rad_s2.min(), run.alpha_rad_s2.max()])
+        axes.plot(ends, run.line.inertia_kg_m2 * ends + run.line.intercept_nm, "--", color="C3", lw=1.2)
+        axes.set_title(f"{index + 1}: T = {run.line.inertia_kg_m2:.2f} α + {run.line.intercept_nm:.0f}", fontsize=8,
+                       pad=3)
+        axes.tick_params(labelsize=7)
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
+        axes.locator_params(axis="y", nbins=5)
+        axes.yaxis.get_offset_text().set_fontsize(7)
+        axes.grid(alpha=0.3)
     figure.supxlabel("angular acceleration α, rad/s²", fontsize=10)
     figure.supylabel("torque T, N·m", fontsize=10)
     figure.tight_layout(w_pad=1.2, h_pad=0.6)
-
-
-def _panel(axes: Axes, number: int, run: DesignRun) -> None:
-    axes.plot(run.alpha_rad_s2, run.torque_nm, ".", color="C0", ms=2, rasterized=True)
-    ends = np.array([run.alpha_rad_s2.min(), run.alpha_rad_s2.max()])
-    axes.plot(ends, run.line.inertia_kg_m2 * ends + run.line.intercept_nm, "--", color="C3", lw=1.2)
-    axes.set_title(f"{number}: T = {run.line.inertia_kg_m2:.2f} α + {run.line.intercept_nm:.0f}", fontsize=8, pad=3)
-    axes.tick_params(labelsize=7)
-    axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
-    axes.locator_params(axis="y", nbins=5)
-    axes.yaxis.get_offset_text().set_fontsize(7)
-    axes.grid(alpha=0.3)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

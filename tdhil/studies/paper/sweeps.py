@@ -49,10 +49,11 @@ def draw_sweep(figure: Figure, swept: str, curves: Sequence[Curve], responses: S
     """Draw the waveforms on the left, the input in red as in the paper; on the right the measured values."""
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1.0))
     waves = figure.add_subplot(grid[:, 0])
-    shades = _shades(len(curves))
-    for curve, shade in zip(curves, shades, strict=True):
+    shades = ("0.1", "C0", "C2", "C1", "C4", "C5", "C6", "C8", "C9")    # the usual ones without red, the input's
+    for index, curve in enumerate(curves):
         shown = curve.periods <= _SHOWN_PERIODS
-        waves.plot(curve.periods[shown], curve.speed_rad_s[shown], color=shade, lw=1.2, label=f"{curve.value:g}")
+        waves.plot(curve.periods[shown], curve.speed_rad_s[shown], color=shades[index % len(shades)], lw=1.2,
+                   label=f"{curve.value:g}")
     shown = curves[0].periods <= _SHOWN_PERIODS
     waves.plot(curves[0].periods[shown], curves[0].asked_rad_s[shown], color="C3", lw=1.6, ls="--", label="input")
     low, high = waves.get_ylim()
@@ -83,12 +84,6 @@ def draw_sweep(figure: Figure, swept: str, curves: Sequence[Curve], responses: S
         axes.minorticks_off()
     axes.set_xlabel(LABELS[swept])
     figure.tight_layout()
-
-
-def _shades(count: int) -> list[str]:
-    """Return the usual colours without red, which is the input's."""
-    usable = ("0.1", "C0", "C2", "C1", "C4", "C5", "C6", "C8", "C9")
-    return [usable[index % len(usable)] for index in range(count)]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
