@@ -496,21 +496,17 @@ def _fit(link: driver.Link, unit: int, profile: ModbusProfile, vendor: str) -> P
             return None
         if use.name.startswith("parameters."):
             counts[use.name.partition(".")[2]] = raw
+    plate: bool | None = None
+    if profile.name_plate is not None:
+        table = PreflightTable()
+        found = driver.Parameters(counts, driver.settle(profile, counts, {}))
+        rated_nm = driver.find_rated_torque(table, profile, found, None)
+        if rated_nm is not None or profile.parameter(profile.name_plate.torque).unit != "rated":
+            table.checks.clear()
+            driver.check_name_plate(table, profile, found, rated_nm or 0.0)
+            plate = bool(table.checks) and all(check.outcome.value == "ok" for check in table.checks)
     maker = profile.name.partition("/")[0]
-    return ProfileFit(profile.name, _plate(profile, counts), bool(vendor) and maker in vendor.lower())
-
-
-def _plate(profile: ModbusProfile, counts: dict[str, int]) -> bool | None:
-    if profile.name_plate is None:
-        return None
-    table = PreflightTable()
-    found = driver.Parameters(counts, driver.settle(profile, counts, {}))
-    rated_nm = driver.find_rated_torque(table, profile, found, None)
-    if rated_nm is None and profile.parameter(profile.name_plate.torque).unit == "rated":
-        return None
-    table.checks.clear()
-    driver.check_name_plate(table, profile, found, rated_nm or 0.0)
-    return bool(table.checks) and all(check.outcome.value == "ok" for check in table.checks)
+    return ProfileFit(profile.name, plate, bool(vendor) and maker in vendor.lower())
 
 
 SCAN = "scan"

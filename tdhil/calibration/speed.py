@@ -81,7 +81,14 @@ def calibrate_by_turns(counted: CountedTurns, wanted: float, confidence: float =
         SpeedBudgetLine("lag and rounding of the reported speed", bound, "rad/s", "rectangular", CERTAIN,
                         bound / speed),
     ) if line.standard_uncertainty > 0.0)
-    return _concluded("turns", value, budget, wanted, confidence, _least_turns(counted, wanted, confidence))
+    # Turns that reach ``wanted`` at this speed; None if the uncertainty of the speed prevents it. The bound comes from
+    # the ends of the stretch and would shrink with its length; here it stays constant, as rounding does.
+    fixed = (counted.speed_sd_rad_s / counted.speed_rad_s) ** 2
+    fixed += (counted.speed_bound_rad_s / counted.speed_rad_s) ** 2 / 3.0
+    left = (wanted / student_quantile(confidence, CERTAIN)) ** 2 - fixed
+    of_ends = math.hypot(counted.turns_sd, counted.seconds_sd * counted.turns / counted.seconds)
+    least = None if left <= 0.0 else math.ceil(of_ends / math.sqrt(left))
+    return _concluded("turns", value, budget, wanted, confidence, least)
 
 
 def calibrate_by_position(
@@ -144,17 +151,3 @@ def _concluded(
             " the shaft at which they were counted (--at motor or main)", method, budget=budget)
     return SpeedCalibration(Verdict.VALID, f"the factor is known to ±{factor.half_width_share:.2%}", "", method, factor,
                             budget)
-
-
-def _least_turns(counted: CountedTurns, wanted: float, confidence: float) -> int | None:
-    """Return the turns that reach ``wanted`` at this speed; None if the uncertainty of the speed prevents it."""
-    k = student_quantile(confidence, CERTAIN)
-    fixed = (counted.speed_sd_rad_s / counted.speed_rad_s) ** 2
-    # the bound comes from the ends of the stretch and would shrink with its length; here it stays constant, as rounding
-    # does
-    fixed += (counted.speed_bound_rad_s / counted.speed_rad_s) ** 2 / 3.0
-    left = (wanted / k) ** 2 - fixed
-    if left <= 0.0:
-        return None
-    of_ends = math.hypot(counted.turns_sd, counted.seconds_sd * counted.turns / counted.seconds)
-    return math.ceil(of_ends / math.sqrt(left))

@@ -29,7 +29,14 @@ def page_of(text: str) -> str:
 
 def row_of(option: Option) -> str:
     """Return the option's row: key, default, flag and meaning. Without a key: flag, keyword in Python and meaning."""
-    meaning = _meaning(option)
+    meaning = option.more or option.help_text
+    if option.unit is not None and option.unit.symbol != "1":
+        meaning = f"{option.unit.symbol}{' ' if meaning.startswith('(') else '; '}{meaning}"
+    if isinstance(option.choices, Mapping):
+        meaning += ". " + "; ".join(f"`{name}`: {entry.text}" for name, entry in option.choices.items())
+    elif option.allowed:
+        *first, last = (f"`{name}`" for name in option.allowed)
+        meaning += f": {', '.join(first)} or {last}"
     if not option.at:
         return f"{_start(option)} | {f'`{option.keyword}`' if option.python else ''} | {meaning} |"
     return f"{_start(option)} | {option.default_text or '–'} | `{option.flag}` | {meaning} |"
@@ -42,18 +49,6 @@ def _start(option: Option) -> str:
 def _section(option: Option) -> str:
     """Return the section of rig.yaml; '' for the top level, '-' for an option that no file states."""
     return option.at.rpartition(".")[0] if option.at else "-"
-
-
-def _meaning(option: Option) -> str:
-    text = option.more or option.help_text
-    if option.unit is not None and option.unit.symbol != "1":
-        text = f"{option.unit.symbol}; {text}" if not text.startswith("(") else f"{option.unit.symbol} {text}"
-    if isinstance(option.choices, Mapping):
-        return f"{text}. " + "; ".join(f"`{name}`: {entry.text}" for name, entry in option.choices.items())
-    if option.allowed:
-        *first, last = (f"`{name}`" for name in option.allowed)
-        return f"{text}: {', '.join(first)} or {last}"
-    return text
 
 
 if __name__ == "__main__":

@@ -156,7 +156,7 @@ def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _
             f"the record has a sample every {step:.3g} s, and the torque at the bit is needed up to {highest:.2g} Hz",
             next_step=f"Record at {LEAST_SAMPLES * highest:.2g} Hz or faster")
     size = round(SEGMENT_PERIODS * period_s / step)
-    window = np.hanning(size)
+    window, ramp = np.hanning(size), np.linspace(-1.0, 1.0, size)
     hertz: Array = np.asarray(np.fft.rfftfreq(size, step), dtype=np.float64)
     band = (hertz >= LOWEST_MODE_SHARE * mode) & (hertz <= highest)
     white = hertz >= WHITE_FROM * 0.5 / step
@@ -173,7 +173,9 @@ def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _
                          for one in (record.speed_rad_s, record.torque_nm))
         for start in range(0, len(grid) - size + 1, size // 2):
             parts = [one[start : start + size] for one in (speed, torque)]
-            lines = [np.fft.rfft(window * _without_ramp(one)) for one in parts]
+            levels = [one - one.mean() for one in parts]
+            lines = [np.fft.rfft(window * (level - ramp * float(level @ ramp) / float(ramp @ ramp)))
+                     for level in levels]
             noise = [float(np.mean(np.abs(one[white]) ** 2)) / per_density for one in lines]
             rows.append((lines[0][band], lines[1][band], noise[0], noise[1], float(parts[0].mean())))
     if len(rows) < LEAST_SEGMENTS:
@@ -186,13 +188,6 @@ def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _
     speeds, torques, speed_noise, torque_noise, means = zip(*rows, strict=True)
     return _ReportSpectra(hertz[band], np.array(speeds), np.array(torques), per_density, float(np.median(speed_noise)),
                     float(np.median(torque_noise)), float(np.mean(means)))
-
-
-def _without_ramp(signal: Array) -> Array:
-    ramp = np.linspace(-1.0, 1.0, len(signal))
-    level = signal - signal.mean()
-    found: Array = level - ramp * float(level @ ramp) / float(ramp @ ramp)
-    return found
 
 
 def _carried_down(string: DrillString, s: ComplexArray, speed: ComplexArray, torque: ComplexArray

@@ -85,11 +85,15 @@ def schedule(
         report(f"gains at {depth_m:.0f} m")
         rows.append(_row(replace(case, string=at_depth(case.string, depth_m)), depth_m, kind, simulated))
     for above, below in pairwise(rows):
-        if above.controller is not None and below.controller is not None:
+        one, other = above.controller, below.controller
+        if one is not None and other is not None:
             depth_m = 0.5 * (above.depth_m + below.depth_m)
             report(f"interpolated gains at {depth_m:.0f} m")
             own = replace(case, string=at_depth(case.string, depth_m))
-            halfway = _halfway(above.controller, below.controller)
+            halfway = replace(
+                one, gain_nm_s_rad=0.5 * (one.gain_nm_s_rad + other.gain_nm_s_rad),
+                integral_nm_rad=0.5 * (one.integral_nm_rad + other.integral_nm_rad),
+                compensated_kg_m2=0.5 * (one.compensated_kg_m2 + other.compensated_kg_m2))
             between.append(_judged(own, DepthRow(depth_m, string_modes_hz(own.string)[0], halfway), simulated))
     return DepthSchedule(kind, "present" if case.present is not None else "stiff", tuple(rows), tuple(between))
 
@@ -117,10 +121,3 @@ def _judged(case: TuneCase, row: DepthRow, simulated: bool, samples: TruthMargin
     laws = [row.controller, None if case.present is not None else other]
     cure, compared = noisy_cures(samples.truths, laws, (row.mode_hz,))
     return replace(row, cure=cure, compared=compared)
-
-
-def _halfway(one: SpeedController, other: SpeedController) -> SpeedController:
-    return replace(
-        one, gain_nm_s_rad=0.5 * (one.gain_nm_s_rad + other.gain_nm_s_rad),
-        integral_nm_rad=0.5 * (one.integral_nm_rad + other.integral_nm_rad),
-        compensated_kg_m2=0.5 * (one.compensated_kg_m2 + other.compensated_kg_m2))

@@ -65,20 +65,12 @@ def disturbed_trials(
 ) -> DisturbedTrials:
     """Return simulated trials at set speeds around the predicted critical speed.
 
+    The bit turns in a trial by the rule of the run: calm within the trial.
     ``unknown_nm``: unknown torque of the observer at each cycle of ``period_s``, N·m at the main shaft. Raises
     ValueError if no bit is stated.
     """
     lowest, highest = BELOW_SHARE * predicted_rpm.low, max(program.highest_rad_s / RPM, predicted_rpm.high)
     speeds_rpm = np.linspace(lowest, highest, ceil((highest - lowest) / STEP_RPM) + 1)
-    turns = _turning_trials(string, drive, law, program, speeds_rpm, unknown_nm, period_s)
-    return DisturbedTrials(speeds_rpm, turns.sum(axis=0))
-
-
-def _turning_trials(
-    string: DrillString, drive: TopDrive, law: SpeedController, program: SpeedProgram, speeds_rpm: Array,
-    unknown_nm: Array, period_s: float,
-) -> NDArray[np.bool_]:
-    """Return for each trial and set speed whether the bit turns, by the rule of the run: calm within the trial."""
     random = np.random.default_rng(TRIAL_SEED)
     each = max(1, round(LONGEST_SAMPLE_S / period_s))
     count = max(1, len(unknown_nm) // each)
@@ -93,6 +85,5 @@ def _turning_trials(
                      disturbance=TopDisturbance(courses, each * period_s))
     at = np.arange(len(trace.time_s))[:, None, None]
     since = at - np.maximum.accumulate(np.where(trace.bit_rad_s == 0.0, at, -1), axis=0)
-    calm = program.calm_s / (trace.time_s[1] - trace.time_s[0])
-    turned: NDArray[np.bool_] = since.max(axis=0) >= calm
-    return turned
+    turned = since.max(axis=0) >= program.calm_s / (trace.time_s[1] - trace.time_s[0])
+    return DisturbedTrials(speeds_rpm, turned.sum(axis=0))

@@ -345,7 +345,14 @@ class DrillString:
         """Return (speed, torque) at the top for the given ones at the lower end of the last line."""
         for line in reversed(self.lines):
             series, shunt = line.compliance_rad_nm_m * s, line.inertia_kg_m * s + line.drag_nm_s_rad_m
-            cosh, sinh_over = _cosh_and_sinh_over(series * shunt, line.length_m)
+            square, length = series * shunt, line.length_m
+            root = np.sqrt(square)      # γ
+            product = root * length
+            small = np.abs(product) < 1e-4
+            cosh = np.cosh(product)
+            # sinh(γL)/γ, by its series if γL is small
+            sinh_over = np.where(small, length * (1.0 + square * length**2 / 6.0),
+                                 np.sinh(product) / np.where(small, 1.0, root))
             speed, torque = cosh * speed + series * sinh_over * torque, shunt * sinh_over * speed + cosh * torque
         return speed, torque
 
@@ -353,16 +360,6 @@ class DrillString:
         """Return the string's impedance Z_s = τ/ω at the top, N·m·s/rad."""
         speed, torque = self.at_top(s, stuck=stuck)
         return torque / speed
-
-
-def _cosh_and_sinh_over(square: Complex, length: float) -> tuple[Complex, Complex]:
-    """Return cosh γL and sinh(γL)/γ for ``square`` = γ²."""
-    root = np.sqrt(square)
-    product = root * length
-    small = np.abs(product) < 1e-4
-    safe = np.where(small, 1.0, root)
-    over = np.where(small, length * (1.0 + square * length**2 / 6.0), np.sinh(product) / safe)
-    return np.cosh(product), over
 
 
 def line_of(section: PipeSection) -> WaveLine:
@@ -402,21 +399,17 @@ def string_of(file: StringFile) -> DrillString:
                           bottom.torque_per_weight_nm_kn)
     sections = (*file.sections, *bottom.sections)
     lines = tuple(line_of(section) for section in sections)
-    return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name,
-                       tolerance=_tolerance_of(file, sections))
-
-
-def _tolerance_of(file: StringFile, sections: tuple[PipeSection, ...]) -> StringTolerance:
-    """Return the tolerances of the file. Without a stated G, the range is that of all values fitted to field data."""
     stated = file.tolerance or ToleranceFile()
-    shear = tuple(one / STEEL_SHEAR_MODULUS_PA for one in SHEAR_RANGE_PA)
+    # without a stated G, the range is that of all values fitted to field data
+    low, high = (one / STEEL_SHEAR_MODULUS_PA for one in SHEAR_RANGE_PA)
     if stated.shear_modulus is not None:
-        shear = (1.0 - stated.shear_modulus, 1.0 + stated.shear_modulus)
+        low, high = 1.0 - stated.shear_modulus, 1.0 + stated.shear_modulus
     elif any(section.shear_modulus_pa != STEEL_SHEAR_MODULUS_PA for section in sections):
-        shear = (1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE)
-    return StringTolerance(
-        stated.length, (shear[0], shear[1]), (1.0 - stated.wear, 1.0), 1.0 + stated.drag,
+        low, high = 1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE
+    tolerance = StringTolerance(
+        stated.length, (low, high), (1.0 - stated.wear, 1.0), 1.0 + stated.drag,
         stated.bottom_inertia, stated.bit_torque, 1.0 + stated.stribeck_speed, 1.0 + stated.noise)
+    return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name, tolerance=tolerance)
 
 
 def load_string(path: Path) -> DrillString:

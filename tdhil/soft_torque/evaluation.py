@@ -294,10 +294,11 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
     clamped = int(column["clamped"].sum())
     foreign = unknown / max(1e-9, float(np.sqrt(np.mean(net[coupled] ** 2)))) if coupled.any() else 0.0
     reached = float(set_rad_s.max())
-    disturbed = None
-    if critical is not None and _distance_rpm(critical, case.prediction.cure_rpm) > TOLERANCE_RPM:
-        disturbed = disturbed_trials(case.string, case.meant, case.law, program, case.prediction.cure_rpm,
-                                     column["unknown_nm"][coupled], period_s)
+    disturbed, cure = None, case.prediction.cure_rpm
+    # the bracket of the critical speed does not meet the predicted interval
+    if critical is not None and max(cure.low - critical.value, critical.low - cure.high) > TOLERANCE_RPM:
+        disturbed = disturbed_trials(case.string, case.meant, case.law, program, cure, column["unknown_nm"][coupled],
+                                     period_s)
     outcome, why = _verdict(case, program, clamped, (unknown, foreign), did_stick, critical, decay, reached,
                             disturbed)
     if contradiction:
@@ -353,11 +354,6 @@ def _verdict(
     if seen.high - seen.low > OPEN_DAMPING:
         words += f"; {of_damping} is too uncertain to compare"
     return EvaluationOutcome.AS_PREDICTED, words
-
-
-def _distance_rpm(critical: Interval, predicted: Interval) -> float:
-    """Return the distance of the bracket of a critical speed from a predicted interval, rpm; 0 if they meet."""
-    return max(predicted.low - critical.value, critical.low - predicted.high, 0.0)
 
 
 def _rms(values: Array) -> float | None:

@@ -69,8 +69,10 @@ def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[T
     softest = softest_allowed(case.string, case.drive, held[0])
     asked = case.softness
     if asked is not None and asked >= softest:
-        raise TuningRefused(_toosoft(case, asked, softest, held), where=f"--a {asked:g}",
-                            next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
+        raise TuningRefused(
+            f"a = {asked:.2g} is beyond ζ/(ω² J Στ) = {softest:.2g}: with {_lag_ms(case)} of lag in the loop and the "
+            f"string's lowest mode at {held[0]:.3g} Hz the drive would amplify slow oscillations", where=f"--a {asked:g}",
+            next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
     grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], (0.0,),
                                       SOFTNESSES if asked is None else (asked,))
             if asked is not None or one.softness <= LAG_RESERVE * softest_allowed(
@@ -195,40 +197,23 @@ def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> T
 def largest_stable_share(
     case: TuneCase, softness: float, held_hz: Sequence[float], believed_upper: bool = True
 ) -> float:
-    """Return the largest compensated share of the estimated J that is stable for every J of the interval.
+    """Return the largest compensated share of the estimated J that is stable over J's and over each other interval.
 
-    The resolution is 0.01; 0 means that no share is stable. ``believed_upper``: the loop must also be stable with
-    gains that are computed from the upper end of the interval.
+    The resolution is 0.01; 0 means that no share is stable. The gains from the estimated J are checked at both ends of
+    J's interval. ``believed_upper``: the gains from its upper end are checked at the estimated J. Each other parameter
+    is moved to either end of its interval, with J at its lower end, which allows the least compensation.
     """
-    low, high = 0.0, 1.0
+    inertia, low, high = case.inertia_kg_m2, 0.0, 1.0
+    ends = [end for pair in case.moves(present=False) for end in pair]
     while high - low > 0.01:
         middle = 0.5 * (low + high)
-        stable = _stable_everywhere(case, softness, middle, held_hz, believed_upper)
+        law = tuned_controller(case.string, inertia.value, softness, held_hz[0], middle)
+        upper = tuned_controller(case.string, inertia.high, softness, held_hz[0], middle)
+        wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
+        stable = all(is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
+            is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
         low, high = (middle, high) if stable else (low, middle)
     return low
-
-
-def _stable_everywhere(
-    case: TuneCase, softness: float, share: float, held: Sequence[float], believed_upper: bool = True
-) -> bool:
-    """Return whether the loop is stable over J's interval and over each other interval.
-
-    The gains from the estimated J are checked at both ends of J's interval. ``believed_upper``: the gains from the
-    upper end are checked at the estimated J. Each other parameter is moved to either end of its interval, with J at its
-    lower end, which allows the least compensation.
-    """
-    inertia = case.inertia_kg_m2
-    law = tuned_controller(case.string, inertia.value, softness, held[0], share)
-    upper = tuned_controller(case.string, inertia.high, softness, held[0], share)
-    wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
-    ends = [end for pair in case.moves(present=False) for end in pair]
-    return all(is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
-        is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
-
-
-def _toosoft(case: TuneCase, softness: float, softest: float, held: Sequence[float]) -> str:
-    return (f"a = {softness:.2g} is beyond ζ/(ω² J Στ) = {softest:.2g}: with {_lag_ms(case)} of lag in the loop and "
-            f"the string's lowest mode at {held[0]:.3g} Hz the drive would amplify slow oscillations")
 
 
 def _lag_ms(case: TuneCase) -> str:

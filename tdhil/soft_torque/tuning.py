@@ -206,7 +206,11 @@ def _without_noise(
                     for part in one.wrong if part.stable]
         sizes.append(len(own))
         loops += own
-    cures = iter(_quiet_cures(loops, search))
+    by_loop: dict[int, float | None] = {}
+    for string in dict.fromkeys(string for string, _, _ in loops):      # loops on one string are simulated together
+        at = [k for k, (one, _, _) in enumerate(loops) if one == string]
+        by_loop |= zip(at, lowest_turning(string, [loops[k][1:] for k in at], "stuck", search), strict=True)
+    cures = iter([by_loop[k] for k in range(len(loops))])
     done = []
     for one, size in zip(every, sizes, strict=True):
         if not size:
@@ -217,14 +221,3 @@ def _without_noise(
         wrong = tuple(replace(part, cure_rpm=next(cures) if part.stable else None) for part in one.wrong)
         done.append(replace(one, quiet_cures=along, quiet_cures_moved=moved, wrong=wrong))
     return tuple(done)
-
-
-def _quiet_cures(
-    loops: Sequence[tuple[DrillString, TopDrive, SpeedController]], search: Search
-) -> list[float | None]:
-    """Return cure speeds without noise, rpm, in the order of ``loops``. Loops on one string are simulated together."""
-    found: dict[int, float | None] = {}
-    for string in dict.fromkeys(string for string, _, _ in loops):
-        at = [k for k, (one, _, _) in enumerate(loops) if one == string]
-        found |= zip(at, lowest_turning(string, [loops[k][1:] for k in at], "stuck", search), strict=True)
-    return [found[k] for k in range(len(loops))]

@@ -304,7 +304,14 @@ def write_report(chapters: Sequence[Chapter], folder: Path) -> Path:
     """Write the index of all outcomes in ``folder``; an index of the other kind from an earlier run is removed."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        text, path = _html(chapters, folder), folder / "index.html"
+        from jinja2 import Environment
+        from markupsafe import Markup
+
+        environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+        environment.filters["shown"] = shown
+        text, path = environment.from_string(_TEMPLATE).render(
+            chapters=chapters, tally=tally(chapters), marks=MARKS, style=Markup(STYLE),
+            relative=lambda path: path.relative_to(folder).as_posix()), folder / "index.html"
     except ModuleNotFoundError as error:
         if error.name != "jinja2":
             raise
@@ -320,17 +327,6 @@ def tally(chapters: Sequence[Chapter]) -> str:
     """Return how many statements hold, do not hold, or are open."""
     counted = Counter(s.holds for chapter in chapters if chapter.outcome for s in chapter.outcome.statements)
     return f"{counted[True]} statements hold, {counted[False]} do not, {counted[None]} are open"
-
-
-def _html(chapters: Sequence[Chapter], folder: Path) -> str:
-    from jinja2 import Environment
-    from markupsafe import Markup
-
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["shown"] = shown
-    template = environment.from_string(_TEMPLATE)
-    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, style=Markup(STYLE),
-                           relative=lambda path: path.relative_to(folder).as_posix())
 
 
 def _markdown(chapters: Sequence[Chapter], folder: Path) -> str:

@@ -141,15 +141,6 @@ def said_of_slopes(
     """Return statements on the slopes, the common inertia, and open points. ``curve``: the joint fit at the
     frequencies.
     """
-    return (*_slope_statements(records), *_joint_statements(settings, joint, records, curve), *_open(records))
-
-
-def percent(ours: float, published: float | None) -> float | None:
-    """Return the deviation of ``ours`` in percent; None without a published value."""
-    return None if published is None else 100.0 * (ours / published - 1.0)
-
-
-def _slope_statements(records: list[Record]) -> list[Statement]:
     found = []
     for record in records:
         ours, published = record.points.fit.inertia_kg_m2, record.published[0]
@@ -165,7 +156,12 @@ def _slope_statements(records: list[Record]) -> list[Statement]:
         "the fitted slope grows with the tone", "by 76 % from 0.1 to 1 Hz, on one rig", f"by {growth:.0%}, on one rig",
         bool(np.all(np.diff(ordered) > 0.0)),
     ))
-    return found
+    return (*found, *_joint_statements(settings, joint, records, curve), *_open(records))
+
+
+def percent(ours: float, published: float | None) -> float | None:
+    """Return the deviation of ``ours`` in percent; None without a published value."""
+    return None if published is None else 100.0 * (ours / published - 1.0)
 
 
 def _joint_statements(
