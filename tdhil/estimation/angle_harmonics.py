@@ -250,20 +250,6 @@ def _noise(hertz: FloatArray, rest: ComplexArray) -> FloatArray:
     return found
 
 
-def _quieter(segment: _GridSegment, by_speed: ComplexArray, by_angle: ComplexArray) -> ComplexArray:
-    """Return the rest by the angle (K,), in each band in which it has no more than `_LOUDER` times the power of that by
-    the speed. The harmonics in it do not depend on the filter of the speed.
-    """
-    found = by_speed.copy()
-    for begin, end in _bands(segment.hertz):
-        part = slice(begin, min(end, segment.angle_band))
-        if end <= segment.angle_band:
-            loud, quiet = (float(np.median(np.abs(rest[part]) ** 2)) for rest in (by_angle, by_speed))
-            if loud <= _LOUDER * quiet:
-                found[part] = by_angle[part]
-    return found
-
-
 @dataclass(frozen=True)
 class _WeighedSegment:
     """One segment as a model sees it: Y or Y' (K,), the filter of the torque F (K,), and E|noise|² (K,)."""
@@ -301,7 +287,15 @@ class _View:
             through = filters(theta[model.mechanical :], s)[1] * np.exp(-delay_s * s)
             by_speed = one.torque - model.impedance(theta, s) * one.speed
             by_angle = one.torque - model.shaft.impedance(theta[: model.mechanical], s) * through * one.turning
-            found.append(_WeighedSegment(one, _quieter(one, by_speed, by_angle), through, np.ones(len(s))))
+            # By the angle in each band in which it has no more than `_LOUDER` times the power of that by the speed: the
+            # harmonics in it do not depend on the filter of the speed.
+            rest = by_speed.copy()
+            for begin, end in _bands(one.hertz):
+                if end <= one.angle_band:
+                    loud, quiet = (float(np.median(np.abs(by[begin:end]) ** 2)) for by in (by_angle, by_speed))
+                    if loud <= _LOUDER * quiet:
+                        rest[begin:end] = by_angle[begin:end]
+            found.append(_WeighedSegment(one, rest, through, np.ones(len(s))))
         return cls(tuple(found))
 
     def weighted(self, torque: HarmonicTorque | None) -> tuple[_WeighedSegment, ...]:
@@ -377,7 +371,8 @@ def _candidates(seen: tuple[_WeighedSegment, ...], torque: HarmonicTorque | None
         mean = np.fft.rfft(np.bincount(place, weights=signal, minlength=_BINS))[: HIGHEST_ORDER + 1]
         sums += count * mean * np.exp(-1j * np.pi * orders / _BINS)
         # frequency of an order, in lines of the segment's spectrum: n dθ N/2π, with dθ the angle of one step
-        rate, weights = _histogram(np.abs(np.gradient(segment.angle_rad)), segment.taper**2)
+        weights, edges = np.histogram(np.abs(np.gradient(segment.angle_rad)), bins=64, weights=segment.taper**2)
+        rate = 0.5 * (edges[1:] + edges[:-1])
         places = np.multiply.outer(orders, rate) * (count / (2.0 * np.pi)) - segment.chosen.start
         sensitivity = np.abs(one.through) ** 2 / one.noise
         inside = (places >= 0.0) & (places <= len(sensitivity) - 1.0)
@@ -390,11 +385,6 @@ def _candidates(seen: tuple[_WeighedSegment, ...], torque: HarmonicTorque | None
     known = set() if torque is None else set(torque.orders)
     likely = [int(n) for n in np.argsort(-gain) if gain[n] > _FIRST_LOOK * LEAST_GAIN and int(n) not in known]
     return likely[:MOST_ORDERS]
-
-
-def _histogram(values: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    total, edges = np.histogram(values, bins=64, weights=weights)
-    return 0.5 * (edges[1:] + edges[:-1]), total
 
 
 def _search(view: _View) -> HarmonicTorque | None:
@@ -528,11 +518,14 @@ def _through_filter(
     return np.interp(samples.time_s, time, reported, left=0.0, right=float(reported[-1]))
 
 
-def _lines_of_parts(case: PeriodicCase, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
-                    ) -> list[ComplexArray]:
-    """Return the reported lines of each part of the torque, 1 N·m, in every segment mean of the model's lines."""
+def _widened(
+    case: PeriodicCase, finding: Finding, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
+) -> Finding:
+    """Return the finding with the part of the harmonics in the uncertainty of J."""
+    if finding.inertia is None:
+        return finding
     mechanical = model.curve.fitted.problem.model.mechanical
-    by_segment = {}
+    by_segment = {}      # reported lines of each part of the torque, 1 N·m
     for number, segment in segments.items():
         omega: FloatArray = np.asarray(2.0 * np.pi * np.array(case.fits[number].lines_hz), dtype=np.float64)
         s: ComplexArray = np.asarray(1j * omega, dtype=np.complex128)
@@ -542,16 +535,7 @@ def _lines_of_parts(case: PeriodicCase, segments: dict[int, _GridSegment], torqu
         waves = [wave(order * segment.angle_rad) for order in torque.orders for wave in (np.cos, np.sin)]
         own = np.array([_lines(time, wave.reshape(segment.periods, -1).mean(axis=0), 0.0, omega) for wave in waves])
         by_segment[number] = own * filters(model.theta[mechanical:], s)[1] * np.exp(-s * model.delay_s)
-    return segment_means(case, model.curve, by_segment)
-
-
-def _widened(
-    case: PeriodicCase, finding: Finding, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
-) -> Finding:
-    """Return the finding with the part of the harmonics in the uncertainty of J."""
-    if finding.inertia is None:
-        return finding
-    lines = _lines_of_parts(case, segments, torque, model)
+    lines = segment_means(case, model.curve, by_segment)
     if not lines:
         return finding
     rows = inertia_changes(model.curve, model.theta, lines).sum(axis=1)

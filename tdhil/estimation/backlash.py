@@ -339,21 +339,17 @@ def _angle_of(
     s: ComplexArray = np.asarray(2j * np.pi * harmonics / segment.period_s, dtype=np.complex128)
     lowest = min(excited) - 1
     rough = abs(complex(torque[:, lowest].mean() / (s[lowest] ** 2 * table[:, lowest].mean())))
-    rest = table - torque / (_torque_filter(finding, s) * s**2 * rough)
+    through = np.ones_like(s)      # the filter of the reported torque, if a model was fitted
+    if isinstance(finding.curve, ModelCurve):
+        fitted = finding.curve.fitted
+        through = filters(fitted.likelier.theta[fitted.problem.model.mechanical :], s)[1]
+    rest = table - torque / (through * s**2 * rough)
     free = ~np.isin(harmonics, excited)
     mean = rest.mean(axis=0)
     scatter = np.sum(np.abs(rest - mean) ** 2, axis=0)[free] / (len(rest) - 1)
     return _SegmentAngle(
         segment.period_s, segment.offset_rad_s, excited, table.mean(axis=0), harmonics[free], mean[free],
         _smoothed(harmonics[free], scatter, len(rest) - 1) / len(rest))
-
-
-def _torque_filter(finding: Finding, s: ComplexArray) -> ComplexArray:
-    """Return the filter of the reported torque (H,); 1 if no model was fitted."""
-    if not isinstance(finding.curve, ModelCurve):
-        return np.ones_like(s)
-    model, theta = finding.curve.fitted.problem.model, finding.curve.fitted.likelier.theta
-    return filters(theta[model.mechanical :], s)[1]
 
 
 def _lines(time: FloatArray, signal: FloatArray, start_s: float, period_s: float, highest: int) -> ComplexArray:
@@ -407,7 +403,13 @@ def _fitted(seen: _Seen) -> _FittedBacklash | None:
     for _ in range(_PASSES):
         z, excited = seen.waves(rows, _COARSE_STEPS, tuple(coarse.size * own for own in excited))
         coarse = seen.likelihood(z)
-    return _descended(seen, rows[_starts(coarse.value)], largest, without)
+    # The likeliest candidates of the grid for each time from flank to flank, rebound and share of b ω. From a few
+    # starts alone, a fit may end beside the likeliest backlash: rebound and time from flank to flank trade.
+    kinds = len(_VISCOUS) * len(_REBOUNDS)
+    table = coarse.value.reshape(len(_CROSSINGS), len(_LEAVINGS), kinds)
+    place = np.ravel_multi_index(
+        (np.arange(len(_CROSSINGS))[:, None], np.argmin(table, axis=1), np.arange(kinds)), table.shape)
+    return _descended(seen, rows[place.ravel()], largest, without)
 
 
 def _grid(seen: _Seen, motions: list[FloatArray], largest: float) -> FloatArray:
@@ -460,18 +462,6 @@ def _descended(seen: _Seen, rows: FloatArray, largest: float, without: float) ->
     covariance: FloatArray = np.asarray(np.linalg.pinv(2.0 * normal, hermitian=True), dtype=np.float64)
     return _FittedBacklash(rows[best], last, gain, covariance, tuple(one[:, best : best + 1] for one in play),
                            seen.explained(last * z[best]))
-
-
-def _starts(values: FloatArray) -> IntArray:
-    """Return the likeliest candidates of the grid for each time from flank to flank, rebound and share of b ω.
-
-    From a few starts alone, a fit may end beside the likeliest backlash: rebound and time from flank to flank trade.
-    """
-    kinds = len(_VISCOUS) * len(_REBOUNDS)
-    table = values.reshape(len(_CROSSINGS), len(_LEAVINGS), kinds)
-    place = np.ravel_multi_index(
-        (np.arange(len(_CROSSINGS))[:, None], np.argmin(table, axis=1), np.arange(kinds)), table.shape)
-    return np.asarray(place.ravel(), dtype=np.int64)
 
 
 def _slopes(

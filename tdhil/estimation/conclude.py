@@ -6,7 +6,6 @@ from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.frequency_domain import widened_most_by_scale, with_total
 from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict
-from tdhil.recording import Stage
 
 _SHARPER = "identical filters on reported speed and torque, or known filters, would reduce the uncertainty further"
 _BY_SCALE = "a torque calibration (tdhil calibrate torque) reduces the uncertainty most"
@@ -25,8 +24,9 @@ def conclude(case: Case, finding: Finding) -> Identification:
     if calibrate:
         advice = _BY_SCALE
     warnings = (*case.warnings, *finding.warnings)
-    if case.aborted is not None:
-        said = _aborted(case.aborted)
+    stage = case.aborted
+    if stage is not None:
+        said = f"the run was aborted in stage {stage.name}{f' ({stage.detail})' if stage.detail else ''}"
         if inertia is not None:
             partial = f"{said}. The result uses the data recorded before"
             warnings = (CodedText(partial, MessageCode.RUN_ENDED_EARLY), *warnings)
@@ -84,8 +84,3 @@ def _judged(
         reason = f"{finding.explained}, but the interval is ±{whole:.2%}, {wide}"
         return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER, MessageCode.VALID_WIDE
     return Verdict.VALID, finding.explained, finding.advice or _SHARPER, MessageCode.VALID
-
-
-def _aborted(stage: Stage) -> str:
-    cause = f" ({stage.detail})" if stage.detail else ""
-    return f"the run was aborted in stage {stage.name}{cause}"

@@ -32,11 +32,13 @@ def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_tor
     """Raise Refused if torque trails speed at every one of the excited lines; means in rad/s and N·m."""
     if not lines:
         return
-    if _copied(lines):
-        raise Refused(
-            "the torque is a copy of the speed: their ratio is the same at every line",
-            "check which columns hold speed and torque", entry=MessageCode.SIGNALS_SWAPPED,
-        )
+    if lines[-1].hertz >= 2.0 * lines[0].hertz:      # an octave apart or more
+        ratio = np.concatenate([line.torque / line.speed for line in lines])
+        if np.max(np.abs(ratio - ratio[0].real)) < _COPY * abs(ratio[0].real):
+            raise Refused(
+                "the torque is a copy of the speed: their ratio is the same at every line",
+                "check which columns hold speed and torque", entry=MessageCode.SIGNALS_SWAPPED,
+            )
     clearest = 0.0
     for line in lines:
         cross = (line.torque * np.conj(line.speed)).imag
@@ -59,14 +61,6 @@ def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_tor
         "check which column is which, and the sign of the torque",
         entry=MessageCode.SIGNALS_SWAPPED,
     )
-
-
-def _copied(lines: tuple[SpectralLine, ...]) -> bool:
-    """Return whether T/W is the same real number at lines an octave apart or more."""
-    if lines[-1].hertz < 2.0 * lines[0].hertz:
-        return False
-    ratio = np.concatenate([line.torque / line.speed for line in lines])
-    return bool(np.max(np.abs(ratio - ratio[0].real)) < _COPY * abs(ratio[0].real))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -238,13 +232,14 @@ def strongest_undeclared(stretch: Stretch, fit: PeriodLines, name: str) -> tuple
         return None
     lines = (fit.speed if name == "speed" else fit.torque).mean(axis=0)
     declared = float(np.max(np.abs(lines)))
-    length = stretch.segment.period_s
-    bins = _bins(stretch)
+    length, first = stretch.segment.period_s, min(stretch.index)
+    spans, fewest = max(stretch.index) - first + 1, min(len(period) for period in stretch.periods)
+    # bins of a period: at least two samples to a bin
+    bins = int(min(_BINS_A_CYCLE * max(stretch.segment.lines_hz) * length, fewest / 2.0, _MOST_BINS / spans))
     if bins < 16 or declared <= 0.0:
         return None
     width = length / bins
-    first = min(stretch.index)
-    rest = np.zeros(bins * (max(stretch.index) - first + 1))
+    rest = np.zeros(bins * spans)
     filled = 0
     for number, period in zip(stretch.index, stretch.periods, strict=True):
         begin = stretch.segment.start_s + number * length
@@ -269,14 +264,6 @@ def strongest_undeclared(stretch: Stretch, fit: PeriodLines, name: str) -> tuple
         return None
     best = max(clear, key=lambda k: float(power[k]))
     return float(hertz[best]), float(amplitude[best]), declared
-
-
-def _bins(stretch: Stretch) -> int:
-    """Return the number of bins of a period: at least two samples to a bin."""
-    length = stretch.segment.period_s
-    fewest = min(len(period) for period in stretch.periods)
-    spans = max(stretch.index) - min(stretch.index) + 1
-    return int(min(_BINS_A_CYCLE * max(stretch.segment.lines_hz) * length, fewest / 2.0, _MOST_BINS / spans))
 
 
 def _averaged(

@@ -4,6 +4,7 @@
 enough of them clear of the scatter? 3. Selection of a candidate (`tdhil.estimation.candidates`).
 """
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -158,8 +159,23 @@ def _try_weak_lines(now: _LineWalk) -> _LineWalk:
 
 
 def _with_rigid(now: _LineWalk, lines: tuple[SpectralLine, ...]) -> _LineWalk:
-    rigid = _rigid(now.case, lines)
-    return replace(now, rigid=rigid, finding=_advised(rigid_finding(rigid, now.case), now.case))
+    """Fit the rigid shaft to the lines. Raises Refused for too few lines.
+
+    The arithmetic may fail even for data that passed every check: then there is no rigid shaft.
+    """
+    case = now.case
+    options, scale = case.options, case.recording.torque_scale_rel_sd
+    priors, fixed = known_of(case.recording.lag_prior, len(lines), case.constraint)
+    refusal = refuse_count(len(lines), case.constraint, priors)
+    if not shaft_model(options.model).lags:
+        priors, fixed = (), unfiltered()
+        refusal = None if len(lines) > 1 else _ONE_LINE
+    if refusal is not None:
+        raise _too_few(case, refusal.reason, refusal.advice)
+    rigid: RigidResult | None = None
+    with contextlib.suppress(np.linalg.LinAlgError, FloatingPointError, ValueError):
+        rigid = fit_rigid(lines, case.levels, case.constraint, priors, fixed, options.confidence, scale)
+    return replace(now, rigid=rigid, finding=_advised(rigid_finding(rigid, case), case))
 
 
 def _weak_lines_contradict(now: _LineWalk) -> bool:
@@ -253,24 +269,6 @@ def settled(case: PeriodicCase) -> PeriodicCase:
     every = settled_lines(case.fits, case.stretches, slope, case.levels.warming.own)
     usable = usable_lines(every, _LEAST_NU)
     return replace(case, every=every, usable=usable) if usable else case
-
-
-def _rigid(case: PeriodicCase, lines: tuple[SpectralLine, ...]) -> RigidResult | None:
-    """Return the rigid shaft fitted to the lines; None if the arithmetic fails, which data that passed every check
-    can still cause. Raises Refused for too few lines.
-    """
-    options, scale = case.options, case.recording.torque_scale_rel_sd
-    priors, fixed = known_of(case.recording.lag_prior, len(lines), case.constraint)
-    refusal = refuse_count(len(lines), case.constraint, priors)
-    if not shaft_model(options.model).lags:
-        priors, fixed = (), unfiltered()
-        refusal = None if len(lines) > 1 else _ONE_LINE
-    if refusal is not None:
-        raise _too_few(case, refusal.reason, refusal.advice)
-    try:
-        return fit_rigid(lines, case.levels, case.constraint, priors, fixed, options.confidence, scale)
-    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-        return None
 
 
 def _tie(case: Case, levels: Levels, rough_inertia: float) -> ViscousConstraint | None:

@@ -59,7 +59,12 @@ def _rests(recording: Recording, segment: Segment, first: int, last: int) -> lis
     ):
         part = signal[first:last] if chosen is None else signal[first:last][chosen]
         step = _step(part, quantum)
-        for begin, end in _long_runs(time, part, _longest(part, step, segment)):
+        # longest time that this signal may stay at one value, s; infinite if its amplitude is near its resolution
+        amplitude, longest_s = 0.5 * float(np.nanmax(part) - np.nanmin(part)), math.inf
+        if np.isfinite(amplitude) and amplitude > 2.0 * step:
+            natural = 2.0 * float(np.sqrt(2.0 * step / amplitude)) / (2.0 * np.pi * min(segment.lines_hz))
+            longest_s = max(_NATURAL * natural, _SHARE_OF_CYCLE / max(segment.lines_hz))
+        for begin, end in _long_runs(time, part, longest_s):
             value = float(part[begin])
             still = is_speed and abs(value) <= 2.0 * step
             if still or value in (float(np.nanmax(part)), float(np.nanmin(part))):
@@ -75,17 +80,6 @@ def _step(signal: FloatArray, quantum: float) -> float:
     steps = steps[steps > 0.0]
     seen = float(np.min(steps)) if len(steps) else 0.0
     return max(seen, quantum) if np.isfinite(quantum) else seen
-
-
-def _longest(signal: FloatArray, step: float, segment: Segment) -> float:
-    """Return the longest time that this signal may stay at one value, s; infinite if its amplitude is near its
-    resolution.
-    """
-    amplitude = 0.5 * float(np.nanmax(signal) - np.nanmin(signal))
-    if not (np.isfinite(amplitude) and amplitude > 2.0 * step):
-        return float("inf")
-    natural = 2.0 * float(np.sqrt(2.0 * step / amplitude)) / (2.0 * np.pi * min(segment.lines_hz))
-    return max(_NATURAL * natural, _SHARE_OF_CYCLE / max(segment.lines_hz))
 
 
 def _long_runs(time: FloatArray, signal: FloatArray, longest_s: float) -> list[tuple[int, int]]:
@@ -291,7 +285,10 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
         for number in range(whole):
             begin = start + number * segment.period_s
             period = samples.between(begin - 1e-9, begin + segment.period_s - 1e-9)
-            if _is_whole(period, begin, segment.period_s, interval, longest_gap):
+            if len(period) < max(_LEAST_SHARE * segment.period_s / interval, 8):
+                continue
+            edges = np.concatenate(([begin], period.time_s, [begin + segment.period_s]))
+            if float(np.max(np.diff(edges))) <= longest_gap:
                 kept.append(period)
                 index.append(number + segment.settle_periods)
         found.append(Stretch(segment, tuple(kept), tuple(index)))
@@ -312,13 +309,6 @@ def thinned(period: Samples, blocks: int) -> Samples:
 def usual_interval(time_s: FloatArray) -> float:
     """Return the median time between samples (N,), s."""
     return float(np.median(np.diff(time_s), overwrite_input=True)) if len(time_s) > 1 else math.inf
-
-
-def _is_whole(period: Samples, begin_s: float, length_s: float, interval_s: float, longest_gap_s: float) -> bool:
-    if len(period) < max(_LEAST_SHARE * length_s / interval_s, 8):
-        return False
-    edges = np.concatenate(([begin_s], period.time_s, [begin_s + length_s]))
-    return float(np.max(np.diff(edges))) <= longest_gap_s
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -165,8 +165,13 @@ def friction_curve(
     ``levels``: mean operating points of the excited segments, for the density of the disturbance.
     """
     try:
-        density = _density(recording, samples, levels, inertia.delay)
-        if density is None or not math.isfinite(inertia.value):
+        density = Density(levels.density, levels.dof)
+        if density.dof < _LEAST_DOF:      # too few excited periods: also from residuals of momentum balances
+            found = balances(recording, samples)
+            fit = None if found is None else fit_momentum(found, BalanceKind.TURNING, density, inertia.delay,
+                                                          Resolution(0.0, 0.0), 0.95)
+            density = density if fit is None else fit.density
+        if not (density.dof >= _LEAST_DOF and density.value > 0.0 and math.isfinite(inertia.value)):
             return _NOTHING
         points = merged(steady_points(recording, samples, inertia, density.value))
         if len(points) < _LEAST_SPEEDS:
@@ -185,21 +190,10 @@ def friction_curve(
         half = quantile * math.hypot(math.sqrt(point.variance), unsure * point.swing)
         torque = Estimate(point.torque, point.torque - half, point.torque + half)
         shown.append(FrictionPoint(point.speed, torque))
-    spread = abs(bend) * float(np.ptp(_mean_speeds(points, levels))) if bent else 0.0
+    # between the mean speeds of the levels B is a chord; with fewer than two levels, between those of the curve
+    speeds = levels.speed if len(levels.speed) > 1 else np.array([point.speed for point in points])
+    spread = abs(bend) * float(np.ptp(speeds)) if bent else 0.0
     return FrictionCurve(tuple(shown), p_value, bent, spread)
-
-
-def _density(recording: Recording, samples: Samples, levels: Levels, delay: Delay) -> Density | None:
-    """Return the density from the friction of the excited periods; with too few, also from residuals of momentum
-    balances.
-    """
-    own = Density(levels.density, levels.dof)
-    if own.dof < _LEAST_DOF:
-        found = balances(recording, samples)
-        fit = None if found is None else fit_momentum(found, BalanceKind.TURNING, own, delay, Resolution(0.0, 0.0),
-                                                      0.95)
-        own = own if fit is None else fit.density
-    return own if own.dof >= _LEAST_DOF and own.value > 0.0 else None
 
 
 def _columns(points: list[FrictionStretch]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -237,10 +231,3 @@ def _bend(points: list[FrictionStretch]) -> tuple[float, float]:
     spread = np.linalg.pinv((weighted / scale).T @ (weighted / scale), rcond=1e-9) / np.outer(scale, scale)
     fitted = spread @ weighted.T @ (torque * weight)
     return float(fitted[1]), math.sqrt(max(float(spread[1, 1]), 0.0))
-
-
-def _mean_speeds(points: list[FrictionStretch], levels: Levels) -> FloatArray:
-    """Return the mean speeds of the levels, between which B is a chord; with fewer than two levels, those of the
-    curve.
-    """
-    return levels.speed if len(levels.speed) > 1 else np.array([point.speed for point in points])

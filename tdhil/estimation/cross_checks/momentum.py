@@ -314,7 +314,10 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
     periodic = periodic_segments(recording)
     calm = calm_spans(blocks, periodic)
     knots = [knot for span in calm for knot in _calm_knots(span, _CLOSER_S if alone else _APART_S)]
-    knots += [knot for segment in periodic for knot in _period_knots(segment)]
+    for segment in periodic:      # the first and the last whole period
+        start, period = segment.start_s, segment.period_s
+        last = start + (int((segment.end_s - start) / period + 1e-6) - 1) * period
+        knots += [Knot(at, at + period, periodic=True) for at in (start, last)]
     if not knots:
         return None
     knots += _stage_knots(recording, samples, blocks, knots)
@@ -400,13 +403,6 @@ def _stage_knots(recording: Recording, samples: Samples, blocks: Blocks, others:
             if np.all(np.abs(blocks.acceleration_rad_s2[inside]) <= _SETTLING_PER_S * reach):
                 found.append(knot)
     return found
-
-
-def _period_knots(segment: Segment) -> list[Knot]:
-    """Return the first and the last whole period of a segment as knots."""
-    period = segment.period_s
-    last = segment.start_s + (int((segment.end_s - segment.start_s) / period + 1e-6) - 1) * period
-    return [Knot(start, start + period, periodic=True) for start in (segment.start_s, last)]
 
 
 def _coast_knots(span: Span, blocks: Blocks, direction: float, low: float) -> list[Knot]:

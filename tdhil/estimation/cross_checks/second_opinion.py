@@ -32,7 +32,7 @@ from tdhil.estimation.cross_checks.momentum_fit import (
 from tdhil.estimation.cross_checks.speed_loop import speed_loop
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
-from tdhil.estimation.samples import Samples, usual_interval
+from tdhil.estimation.samples import usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
@@ -61,9 +61,16 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     warnings = (*finding.warnings, *disagreements(opinions, finding))
     before = _before_acquisition(case, finding)
     against = (*fitted, *before)
-    opinions = _with_least_change(opinions, before, len(against), finding, case.options.confidence)
+    reference, confidence = reference_inertia(finding), case.options.confidence
+    if opinions and before and reference is not None and reference.finite and reference.value > 0.0:
+        # the least change of a signal's scale at stage 5 that would contradict J
+        own = _bent_by(before[0][0].inertia_kg_m2, before[0][1], confidence)
+        half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
+        least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / len(against)) * half / reference.value)
+        note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
+        opinions = (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
     inertia = _inertia(case, finding, opinions)
-    contradiction = _contradiction(against, finding, case.options.confidence)
+    contradiction = _contradiction(against, finding, confidence)
     if contradiction.reason:
         # a withdrawn J gets no further figures, as for residuals that contradict the model
         finding = finding.taken_back(contradiction)
@@ -156,20 +163,6 @@ def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:
     return Estimate(own.value, own.value - half, own.value + half)
 
 
-def _with_least_change(
-    opinions: tuple[SecondOpinion, ...], before: Fitted, compared: int, finding: Finding, confidence: float
-) -> tuple[SecondOpinion, ...]:
-    """Add to the first cross-check the least change of a signal's scale at stage 5 that would contradict J."""
-    reference = reference_inertia(finding)
-    if not opinions or not before or reference is None or not reference.finite or not reference.value > 0.0:
-        return opinions
-    own = _bent_by(before[0][0].inertia_kg_m2, before[0][1], confidence)
-    half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
-    least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / compared) * half / reference.value)
-    note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
-    return (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
-
-
 def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
     """Return one warning for each momentum cross-check that contradicts the finding."""
     reference = reference_inertia(finding)
@@ -191,7 +184,10 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
     recording, levels = case.recording, case.levels
     density = Density(0.0, 0.0) if levels is None else Density(levels.density, levels.dof)
     delay = known_delay(recording, finding)
-    resolution = _resolution(recording, case.samples, found)
+    spans = (case.samples.between(span.start_s, span.end_s) for span in found.calm)
+    calm = [part for part in spans if len(part) > 1]
+    resolution = Resolution(_rounding(recording.speed_resolution_rad_s, [part.speed_rad_s for part in calm]),
+                            _rounding(recording.torque_resolution_nm, [part.torque_nm for part in calm]))
     steps = recording.excitation is not None and has_plateaus(recording.excitation.kind)
     reading = _reading(case, finding)
     opinions = []
@@ -272,23 +268,12 @@ def known_delay(recording: Recording, finding: Finding) -> Delay:
     return UNKNOWN_DELAY
 
 
-def _resolution(recording: Recording, samples: Samples, found: Balances) -> Resolution:
+def _rounding(quantum: float, parts: list[FloatArray]) -> float:
     """Return the error of a mean from rounding to a quantum q, by the scatter σ of the signal at steady speed.
 
     Noise of standard deviation σ before the rounding acts as dither: the error of the mean is at most (q/π)
     e^(−2π²σ²/q²). Without noise it is uniform, with standard deviation q/√12.
     """
-    return Resolution(
-        _rounding(recording.speed_resolution_rad_s, [s.speed_rad_s for s in _calm_samples(samples, found)]),
-        _rounding(recording.torque_resolution_nm, [s.torque_nm for s in _calm_samples(samples, found)]),
-    )
-
-
-def _calm_samples(samples: Samples, found: Balances) -> list[Samples]:
-    return [part for span in found.calm if len(part := samples.between(span.start_s, span.end_s)) > 1]
-
-
-def _rounding(quantum: float, parts: list[FloatArray]) -> float:
     if not quantum > 0.0:
         return 0.0
     seen = float(np.median([np.var(part) for part in parts])) if parts else 0.0

@@ -127,13 +127,9 @@ def usable_lines(every: tuple[SpectralLine, ...], least_nu: float) -> tuple[Spec
 
     The likelihood treats both in the same way, so one is enough.
     """
-    return tuple(line for line in every if line.nu >= least_nu and _clear(line))
-
-
-def _clear(line: SpectralLine) -> bool:
-    speed = np.abs(line.speed) ** 2 * line.periods > _SIGNIFICANT * line.s_ww
-    torque = np.abs(line.torque) ** 2 * line.periods > _SIGNIFICANT * line.s_tt
-    return bool(np.all(speed | torque))
+    return tuple(line for line in every if line.nu >= least_nu and np.all(
+        (np.abs(line.speed) ** 2 * line.periods > _SIGNIFICANT * line.s_ww)
+        | (np.abs(line.torque) ** 2 * line.periods > _SIGNIFICANT * line.s_tt)))
 
 
 @dataclass(frozen=True)
@@ -226,7 +222,11 @@ def _try_string(standing: _LoadWalk) -> _LoadWalk:
     """Fit the string; it stands beside two masses that the data allow and that it does not clearly exceed."""
     two = standing.chosen.fit if isinstance(standing.chosen, Chosen) else None
     string = standing.fitted(StringShaft(), two)
-    if two is not None and not rejects(two.residual) and not _outdoes(string, two):
+    # Two masses stay unless the string gains more over them than one parameter gains by chance. Each model has the
+    # structure of lags that it needs: with filters of two poles and averages, two masses may imitate a string with
+    # first-order lags. These parameters are counted.
+    if (two is not None and not rejects(two.residual)
+            and not _likeliest(two) - _likeliest(string) > chance_gain()):
         return replace(standing, chosen=Chosen(two, string, rejected=not plausible(two)))
     return replace(standing, chosen=Chosen(string, rejected=rejects(string.residual) or not plausible(string)))
 
@@ -272,10 +272,6 @@ def _try_by_difference(standing: _LoadWalk) -> _LoadWalk:
     return replace(standing, chosen=replace(again, unlike_hz=unlike))
 
 
-def _is_rejected(standing: _LoadWalk) -> bool:
-    return isinstance(standing.chosen, Chosen) and standing.chosen.rejected
-
-
 _TRIALS: Mapping[str, ModelTrial[_LoadWalk]] = {
     KNOWN_PIPE: ModelTrial(
         lambda now: now.pipe is not None and now.model.piped and now.countable(STRING, _BY_PIPE), _try_pipe),
@@ -283,7 +279,8 @@ _TRIALS: Mapping[str, ModelTrial[_LoadWalk]] = {
     TWO_MASSES: ModelTrial(lambda now: now.model.compliant is None, _try_two_masses),
     A_STRING: ModelTrial(lambda now: now.model.compliant is None and now.countable(STRING), _try_string),
     SCALED_PIPE: ModelTrial(lambda now: now.contradicted, _try_scaled_pipe),
-    BY_DIFFERENCE: ModelTrial(lambda now: _is_rejected(now) and not now.counted, _try_by_difference),
+    BY_DIFFERENCE: ModelTrial(
+        lambda now: isinstance(now.chosen, Chosen) and now.chosen.rejected and not now.counted, _try_by_difference),
 }
 
 
@@ -301,15 +298,6 @@ def _by_difference(line: SpectralLine) -> SpectralLine:
         return line
     return replace(line, s_ww=ratio * line.s_ww, s_tt=ratio * line.s_tt, s_tw=ratio * line.s_tw,
                    nu=max(float(free), _LEAST_NU))
-
-
-def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
-    """Return whether the gain of the string over two masses is more than one parameter gains by chance.
-
-    Each model has the structure of lags that it needs: with filters of two poles and averages, two masses may imitate a
-    string with first-order lags. These parameters are counted.
-    """
-    return _likeliest(two) - _likeliest(string) > chance_gain()
 
 
 def _likeliest(fit: CompliantFit) -> float:
@@ -431,7 +419,12 @@ class CompliantResult:
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
     """Return the intervals of the selected model; those of two masses also contain the values of a string."""
     alone = intervals(chosen.fit, confidence)
-    fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
+    fixed = alone
+    if chosen.beside is not None:
+        for name, other in inertias(chosen.beside, confidence).items():
+            two: Estimate = getattr(alone, name)
+            united = Estimate(two.value, min(two.low, other.low), max(two.high, other.high))
+            fixed = replace(fixed, **{name: united})
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
     *own, by_model = _budget(chosen.fit, alone.inertia, fixed.inertia, confidence)
     lines = own if by_model.half_width_kg_m2 == 0.0 else [*own, by_model]
@@ -458,15 +451,6 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
 
 def _unless_open(one: Estimate) -> Estimate | None:
     return one if one.bounded else None
-
-
-def _united(one: CompliantIntervals, others: dict[str, Estimate]) -> CompliantIntervals:
-    """Return the values of ``one``, with intervals that cover ``one`` and ``others``."""
-    fixed = {}
-    for name, other in others.items():
-        own: Estimate = getattr(one, name)
-        fixed[name] = Estimate(own.value, min(own.low, other.low), max(own.high, other.high))
-    return replace(one, **fixed)
 
 
 def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confidence: float) -> Estimate | None:
@@ -604,7 +588,9 @@ def _stands(chosen: Chosen, result: CompliantResult, case: PeriodicCase, rigid: 
     if result.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if result.by_model else finding.words
         return replace(finding, inertia=result.inertia, budget=result.budget, words=words)
-    together = _together(result.shaft.total_inertia)
+    total = result.shaft.total_inertia
+    together = "" if total is None else (
+        f"; together they are {total.value:.4g} kg·m² ({printed_interval(total.low, total.high)})")
     return replace(finding, refusal=Refusal(
         f"{finding.explained}, but cannot separate the inertia of the motor from that of the load{together}",
         "excite lines on both sides of the resonance, and well above it, where the motor turns alone",
@@ -625,12 +611,6 @@ def _pipe_contradiction(ratio: float) -> Refusal:
         " run it again",
         MessageCode.STRING_IMPEDANCE_DIFFERS,
     )
-
-
-def _together(total: Estimate | None) -> str:
-    if total is None:
-        return ""
-    return f"; together they are {total.value:.4g} kg·m² ({printed_interval(total.low, total.high)})"
 
 
 def name_of(fit: CompliantFit, asked: str) -> str:

@@ -84,12 +84,15 @@ def _proposals(problem: Likelihood) -> list[FloatArray]:
     kept: list[FloatArray] = []
     for flat in np.argsort(misfits, axis=None, kind="stable"):
         skew_at, at = (int(i) for i in np.unravel_index(flat, misfits.shape))
-        if not np.isfinite(misfits[skew_at, at]) or any(_alike(shapes[at], other) for other in kept):
+        shape = shapes[at]
+        alike = (abs(np.log2(shape[SWING] / other[SWING])) < _ALIKE[0]
+                 and np.all(np.abs(shape[STRING_SHARE:] - other[STRING_SHARE:]) < _ALIKE[1]) for other in kept)
+        if not np.isfinite(misfits[skew_at, at]) or any(alike):
             continue
-        theta = _theta(problem, shapes[at], solved[skew_at][1][at], _SKEWS[skew_at])
+        theta = _theta(problem, shape, solved[skew_at][1][at], _SKEWS[skew_at])
         if theta is not None:
             found.append(theta)
-            kept.append(shapes[at])
+            kept.append(shape)
         if len(found) == _TRIED:
             break
     return found
@@ -110,11 +113,6 @@ def _shapes(problem: Likelihood) -> list[FloatArray]:
                 shape[STRING_SHARE:] = share
                 shapes.append(shape)
     return shapes
-
-
-def _alike(one: FloatArray, other: FloatArray) -> bool:
-    near = abs(np.log2(one[SWING] / other[SWING])) < _ALIKE[0]
-    return bool(near and np.all(np.abs(one[STRING_SHARE:] - other[STRING_SHARE:]) < _ALIKE[1]))
 
 
 def _solved(problem: Likelihood, hung: ComplexArray, skew: float) -> tuple[FloatArray, FloatArray]:
@@ -248,8 +246,11 @@ class ViewedShaft:
     def __init__(self, inner: Shaft, view: ParameterView) -> None:
         self.inner, self.view = inner, view
         self.names = inner.names
-        slope = _total_back(np.ones(len(inner.names)))[1] if view is TOTAL else None
-        self.inertia_row = inner.inertia_row if slope is None else _through(inner.inertia_row, view.index, slope)
+        self.inertia_row = inner.inertia_row
+        if view is TOTAL:      # the same linear combination of m in the parameters of the view
+            self.inertia_row = inner.inertia_row.copy()
+            self.inertia_row[view.index] = 0.0
+            self.inertia_row += inner.inertia_row[view.index] * _total_back(np.ones(len(inner.names)))[1]
         self.viscous_row = inner.viscous_row
 
     def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -307,14 +308,6 @@ def viewed(fitted: FittedModel, view: ParameterView) -> FittedModel:
     whole = simple if fitted.whole is fitted.simple else seen(fitted.whole)
     limits = box(problem, rough_inertia_of(problem))
     return replace(fitted, problem=problem, limits=limits, simple=simple, whole=whole)
-
-
-def _through(row: FloatArray, index: int, slope: FloatArray) -> FloatArray:
-    """Return a linear combination of m in the parameters of the view."""
-    kept = row.copy()
-    kept[index] = 0.0
-    kept += row[index] * slope
-    return kept
 
 
 # ---------------------------------------------------------------------------------------------------------------------

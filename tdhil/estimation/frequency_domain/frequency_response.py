@@ -246,6 +246,11 @@ def _response_line(
     phase = math.atan2(g.imag, g.real)
     high = abs(g) / (1.0 - half) if half < 1.0 else math.inf
     inertia, width = one.z.imag / omega, half * abs(one.z) / omega
+    # coherence |Σ T W*|²/(Σ|T|² Σ|W|²) over the periods
+    counts = line.periods
+    cross = complex(np.sum(counts * line.torque * line.speed.conj())) + line.nu * line.s_tw
+    ww = float(np.sum(counts * np.abs(line.speed) ** 2)) + line.nu * line.s_ww
+    tt = float(np.sum(counts * np.abs(line.torque) ** 2)) + line.nu * line.s_tt
     return ResponseLine(
         hertz=line.hertz,
         magnitude=Estimate(abs(g), abs(g) / (1.0 + half), high),
@@ -253,8 +258,8 @@ def _response_line(
         apparent_inertia_kg_m2=Estimate(inertia, inertia - width, inertia + width),
         noise_rel=one.noise_rel,
         distortion_rel=distortion.rel,
-        coherence=_coherence(line),
-        periods=round(float(np.sum(line.periods))),
+        coherence=min(abs(cross) ** 2 / (ww * tt), 1.0),
+        periods=round(float(np.sum(counts))),
         fitted_magnitude=None if fitted is None else 1.0 / abs(fitted),
         fitted_phase_rad=None if fitted is None else -math.atan2(fitted.imag, fitted.real),
         residual_sd=None if fitted is None else _residual(one, fitted),
@@ -266,15 +271,6 @@ def _residual(one: _PooledLine, fitted: complex) -> float:
     alone = line.s_tt + abs(fitted) ** 2 * line.s_ww
     variance = max(alone - 2.0 * (fitted.conjugate() * line.s_tw).real, 1e-12 * alone)
     return abs(one.z - fitted) * math.sqrt(one.energy / variance)
-
-
-def _coherence(line: SpectralLine) -> float:
-    """Return |Σ T W*|²/(Σ|T|² Σ|W|²) over the periods."""
-    counts = line.periods
-    cross = complex(np.sum(counts * line.torque * line.speed.conj())) + line.nu * line.s_tw
-    ww = float(np.sum(counts * np.abs(line.speed) ** 2)) + line.nu * line.s_ww
-    tt = float(np.sum(counts * np.abs(line.torque) ** 2)) + line.nu * line.s_tt
-    return min(abs(cross) ** 2 / (ww * tt), 1.0)
 
 
 def _drawn(curve: ResponseCurve, hertz: FloatArray) -> tuple[CurvePoint, ...]:

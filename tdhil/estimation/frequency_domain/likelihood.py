@@ -166,7 +166,9 @@ class Likelihood:
             by_v = (g.conj() * self.s_ww - self._s_wt) / v
             pull = u.conj() * gain
             own = pull * self.speed
-            turned = phi * by_v + phi_twice * (q * by_v + self._summed(own))
+            sums = np.empty(len(self.s), dtype=np.complex128)      # over the segments of every line
+            sums.real, sums.imag = self._of_line.dot(own.real), self._of_line.dot(own.imag)
+            turned = phi * by_v + phi_twice * (q * by_v + sums)
             each: ComplexArray = (gain * sized * self.speed) * by_g[:, k] + u * (turned * by_g).real[:, k]
             if self._load is not None:
                 by_q = phi_twice * (self._of_line @ (pull * self._load.lines).real)
@@ -178,19 +180,6 @@ class Likelihood:
             return found.T
 
         return residuals, slopes
-
-    def _summed(self, each: ComplexArray) -> ComplexArray:
-        """Return the sums over the segments of every line."""
-        found = np.empty(len(self.s), dtype=np.complex128)
-        found.real, found.imag = self._of_line.dot(each.real), self._of_line.dot(each.imag)
-        return found
-
-    def _by(self, slopes: ComplexArray) -> ComplexArray:
-        """Return ∂(G W̄ + c N)/∂theta of every segment and line, from ∂G/∂theta (K, P)."""
-        found: ComplexArray = self.speed[:, None] * slopes[self.owner]
-        if self._load is not None:
-            found[:, self._load.index] += self._load.lines
-        return found
 
     def _phi(self, q: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
         """Return φ(q) = √(2 (ν + M) ln(1 + q/ν)/q), (K,), and a function for dφ/dq; by a series if q/ν is small."""
@@ -254,13 +243,6 @@ class Likelihood:
         speed, torque = self._lags
         return signal_filters.shared_lag(float(theta[speed]), float(theta[torque]), self._unseen_s)
 
-    def _shared_lag_row(self, theta: FloatArray) -> FloatArray:
-        """Return the slopes (P,) of `_shared_lag`."""
-        assert self._lags is not None
-        row = np.zeros(self.model.size)
-        _, *row[list(self._lags)] = self._shared_lag(theta)
-        return row
-
     def tie_error(self, theta: FloatArray) -> float:
         """Return the deviation of the friction from that of the levels, in standard deviations.
 
@@ -276,7 +258,10 @@ class Likelihood:
         have 1/sd².
         """
         g, slopes = self.model.impedance_jacobian(theta, self.s)
-        by = self._by(slopes) * self.root_periods[:, None]
+        by: ComplexArray = self.speed[:, None] * slopes[self.owner]      # ∂(G W̄ + c N)/∂theta of every segment and line
+        if self._load is not None:
+            by[:, self._load.index] += self._load.lines
+        by = by * self.root_periods[:, None]
         weight = 2.0 / self.variance(g)
         parts: list[tuple[FloatArray, float]] = []
         for k in range(len(self.s)):
@@ -287,7 +272,8 @@ class Likelihood:
         parts += [(np.outer(row, row), np.inf) for row in self._prior_rows]
         parts += [(np.outer(row, row), np.inf) for row in self.beliefs(theta)[1]]
         if self._lags is not None:
-            row = self._shared_lag_row(theta)
+            row = np.zeros(self.model.size)
+            _, *row[list(self._lags)] = self._shared_lag(theta)
             parts.append((np.outer(row, row), np.inf))
         if self.constraint is not None:
             parts.append((np.outer(self._tie_row, self._tie_row) / self.constraint.sd**2, self.constraint.dof))

@@ -245,8 +245,14 @@ def fit_bends(motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fix
     fixed = {index + 1: value for index, value in fixed.items()}
     fastest = max(float(np.max(speed)) for speed in speeds)
 
-    def near(bend: Bend, start: FloatArray) -> _Near:
-        return _near(bend, motion, priors, fixed, start)
+    def near(bend: Bend, theta: FloatArray) -> _Near:
+        """Return the fit with first-order lags, one descent in each round, from the end of the last one."""
+        for _ in range(_ROUNDS):
+            problem = _problem(bend, motion, priors, theta[BEND + 1 :])
+            first_order = {**dict.fromkeys(problem.model.structure, 0.0), **fixed}
+            fit = minimise(problem, box(problem, rough_inertia_of(problem)), theta, first_order)
+            theta = fit.theta
+        return bend, problem, fit
 
     tried = [near(bend, np.insert(starts[0], BEND, 0.0)) for bend in bends(slowest, fastest)]
     tried += _between(tried, near)
@@ -316,18 +322,6 @@ def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> l
     return [min(seen, key=lambda one: one[2].objective)]
 
 
-def _near(
-    bend: Bend, motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fixed, theta: FloatArray
-) -> _Near:
-    """Return the fit with first-order lags, one descent in each round, from the end of the last one."""
-    for _ in range(_ROUNDS):
-        problem = _problem(bend, motion, priors, theta[BEND + 1 :])
-        first_order = {**dict.fromkeys(problem.model.structure, 0.0), **fixed}
-        fit = minimise(problem, box(problem, rough_inertia_of(problem)), theta, first_order)
-        theta = fit.theta
-    return bend, problem, fit
-
-
 def _apart(theta: FloatArray, mechanical: int) -> FloatArray | None:
     """Return theta without the common lag of both reports; None if that lag is very short."""
     lags = [mechanical + signal_filters.SPEED_LAG, mechanical + signal_filters.TORQUE_LAG]
@@ -387,13 +381,19 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
     if isinstance(finding, Refusal):
         return None
     against = rigid.residual.p_value if rigid.residual is not None else 0.0
+    means = ", ".join(f"{wave.mean:.3g}" for wave in waves)
+    warning = CodedText(
+        f"friction is not linear in speed: it bends {found[0].bend.words}. The model includes this. B is its slope "
+        f"between the mean speeds {means} rad/s",
+        MessageCode.FRICTION_NOT_LINEAR,
+    )
     speak = "contradict" if rejects(rigid.residual) else "cast doubt on"
     return replace(
         finding,
         model=MODEL,
         bent=True,
         preface=f"the residuals {speak} linear friction (p = {against:.1g}); ",
-        warnings=(*finding.warnings, _bend_words(found[0], motion)),
+        warnings=(*finding.warnings, warning),
     )
 
 
@@ -428,11 +428,3 @@ def _budget(
     *lines, scale = budget_of(best.fitted, own, confidence, torque_scale_rel_sd)
     grown = math.sqrt(max((inertia.high - inertia.low) ** 2 - (own.high - own.low) ** 2, 0.0))
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)
-
-
-def _bend_words(best: BentFit, motion: ShaftMotion) -> str:
-    return CodedText(
-        f"friction is not linear in speed: it bends {best.bend.words}. The model includes this. B is its slope "
-        f"between the mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s",
-        MessageCode.FRICTION_NOT_LINEAR,
-    )

@@ -199,8 +199,13 @@ def fit_rigid(
 ) -> RigidResult:
     """Fit, test, and profile. ``fixed``: parameters of theta known for certain (see Model)."""
     inertia, residual, fitted = fit_inertia(lines, constraint, priors, fixed, confidence)
-    if rejects(residual):
-        return _bare(fitted, residual)
+    if rejects(residual):      # values without intervals
+        theta, at = fitted.whole.theta, fitted.problem.model.at
+        point = [Estimate(float(x), float(x), float(x)) for x in theta]
+        lags = (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW)
+        speed_lag, torque_lag, skew = (point[at(lag)] for lag in lags)
+        return RigidResult(point[INERTIA], point[VISCOUS], None, speed_lag, torque_lag, skew, residual, (),
+                           fitted.first_order, fitted)
     viscous = estimate(fitted, VISCOUS, confidence)
     speed_lag, torque_lag, skew = lags_of(fitted, confidence)
     return RigidResult(
@@ -242,17 +247,6 @@ def fit_parameters(
     """Return the fit only, without test and interval."""
     problem = Likelihood(lines, Model(), constraint, priors)
     return fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
-
-
-def _bare(fitted: FittedModel, residual: ResidualTest | None) -> RigidResult:
-    """Return the values of a model that the data reject, without intervals."""
-    theta, at = fitted.whole.theta, fitted.problem.model.at
-    point = [Estimate(float(x), float(x), float(x)) for x in theta]
-    lags = (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW)
-    speed, torque, skew = (point[at(i)] for i in lags)
-    return RigidResult(
-        point[INERTIA], point[VISCOUS], None, speed, torque, skew, residual, (), fitted.first_order, fitted
-    )
 
 
 def lags_of(fitted: FittedModel, confidence: float) -> tuple[Estimate, Estimate, Estimate]:

@@ -5,7 +5,6 @@ adds e²/v.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -128,17 +127,6 @@ class FitProblem:
             return None
         return 1.0 / (2.0 * math.pi * float(np.median(moving)))
 
-    def _of_lags(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the prior on unstated lags: residuals and slopes."""
-        if self._unseen_s is None:
-            return np.zeros(0), np.zeros((0, PARAMETERS))
-        speed_lag_s, torque_lag_s = float(theta[SPEED_LAG]), float(theta[TORQUE_LAG])
-        rows = np.zeros((3, PARAMETERS))
-        value, by_speed, by_torque = shared_lag(speed_lag_s, torque_lag_s, self._unseen_s)
-        rows[0, SPEED_LAG], rows[0, TORQUE_LAG] = _SHARED * by_speed, _SHARED * by_torque
-        rows[1, SPEED_LAG] = rows[2, TORQUE_LAG] = 1.0 / _PLAUSIBLE_S
-        return np.array([_SHARED * value, speed_lag_s / _PLAUSIBLE_S, torque_lag_s / _PLAUSIBLE_S]), rows
-
     def stacked(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return real residuals (R,) whose sum of squares is −2 ln L, and their slopes (R, 10)."""
         found = evaluate(theta, self.bins)
@@ -148,7 +136,14 @@ class FitProblem:
         rows = np.zeros((len(self.priors), PARAMETERS))
         for row, prior in enumerate(self.priors):
             rows[row, prior.index] = 1.0 / prior.sd
-        of_lags, slopes_of_lags = self._of_lags(theta)
+        of_lags, slopes_of_lags = np.zeros(0), np.zeros((0, PARAMETERS))
+        if self._unseen_s is not None:      # the prior on unstated lags
+            speed_lag_s, torque_lag_s = float(theta[SPEED_LAG]), float(theta[TORQUE_LAG])
+            value, by_speed, by_torque = shared_lag(speed_lag_s, torque_lag_s, self._unseen_s)
+            of_lags = np.array([_SHARED * value, speed_lag_s / _PLAUSIBLE_S, torque_lag_s / _PLAUSIBLE_S])
+            slopes_of_lags = np.zeros((3, PARAMETERS))
+            slopes_of_lags[0, SPEED_LAG], slopes_of_lags[0, TORQUE_LAG] = _SHARED * by_speed, _SHARED * by_torque
+            slopes_of_lags[1, SPEED_LAG] = slopes_of_lags[2, TORQUE_LAG] = 1.0 / _PLAUSIBLE_S
         return (
             np.concatenate([error.real, error.imag, known, of_lags]),
             np.concatenate([slopes.real, slopes.imag, rows, slopes_of_lags]),
@@ -271,7 +266,11 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
     free = (INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, *levels)
     limits = box(inertia, 1.0, torque_span_nm, priors)
     every = FitProblem(bins, guessed(bins, inertia).variance, priors, free, limits)
-    keep = _worth_a_look(every, inertia)
+    # bins for the first fit: torque and acceleration above their noise at the highest frequencies
+    moved, _ = smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
+    keep = np.asarray(moved * bins.energy > _CLEAR * every.variance)
+    if np.count_nonzero(keep) < _ENOUGH_BINS:
+        keep = np.ones(len(bins), dtype=np.bool_)
     problem = _part(every, keep)
     fit = min((minimise(problem, _start(inertia, lags, priors)) for lags in _STARTS), key=lambda one: one.objective)
     narrow = _settled(every, keep, fit, _PHASE)
@@ -299,28 +298,20 @@ def _settled(every: FitProblem, keep: BoolArray, fit: Fit, phase: float) -> Foun
             return None
         keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands], phase))
         problem = _part(every, keep)
-        fits = [minimise(problem, start) for start in _starts_from(problem, fit.theta)]
-        fit = min(fits, key=lambda one: one.objective)
+        starts = [fit.theta]
+        # At zero lag a descent stops, even without a minimum: the skew compensates the delay of a short lag, and the
+        # remaining term, its square, has no slope there. A descent that reached zero with the first guess of the noise
+        # may leave it with the estimated noise, from the first lags.
+        fastest = float(np.max(np.abs(problem.bins.s)))
+        if SKEW in problem.free and min(fit.theta[SPEED_LAG], fit.theta[TORQUE_LAG]) * fastest < _NO_LAG:
+            for lags in _STARTS[1:]:
+                starts.append(fit.theta.copy())
+                starts[-1][[SPEED_LAG, TORQUE_LAG, SKEW]] = lags
+        fit = min((minimise(problem, start) for start in starts), key=lambda one: one.objective)
     if unseen := _unseen_levels(problem, fit.theta):
         problem = replace(problem, free=tuple(index for index in problem.free if index not in unseen))
         fit = minimise(problem, _levelled(every, fit.theta, unseen))
     return FoundFit(problem, fit, clear, keep)
-
-
-def _starts_from(problem: FitProblem, theta: FloatArray) -> Iterator[FloatArray]:
-    """Yield theta; then theta with the first lags, for a signal that has nearly no lag.
-
-    At zero lag a descent stops, even without a minimum: the skew compensates the delay of a short lag, and the
-    remaining term, its square, has no slope there. A descent that reached zero with the first guess of the noise may
-    leave it with the estimated noise.
-    """
-    yield theta
-    fastest = float(np.max(np.abs(problem.bins.s)))
-    if SKEW in problem.free and min(theta[SPEED_LAG], theta[TORQUE_LAG]) * fastest < _NO_LAG:
-        for lags in _STARTS[1:]:
-            start = theta.copy()
-            start[[SPEED_LAG, TORQUE_LAG, SKEW]] = lags
-            yield start
 
 
 def _unseen_levels(problem: FitProblem, theta: FloatArray) -> tuple[int, ...]:
@@ -362,14 +353,6 @@ def _rough(bins: Bins) -> float | None:
     driven = float(np.sum(np.abs(bins.torque[low, 0]) ** 2))
     found = math.sqrt(driven / accelerated) if accelerated > 0.0 else 0.0
     return found if 0.0 < found < math.inf else None
-
-
-def _worth_a_look(every: FitProblem, inertia: float) -> BoolArray:
-    """Return the bins for the first fit: torque and acceleration above their noise at the highest frequencies."""
-    bins = every.bins
-    moved, _ = smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
-    keep = np.asarray(moved * bins.energy > _CLEAR * every.variance)
-    return keep if np.count_nonzero(keep) >= _ENOUGH_BINS else np.ones(len(bins), dtype=np.bool_)
 
 
 def _highest(theta: FloatArray, clear_hz: FloatArray, phase: float) -> float:

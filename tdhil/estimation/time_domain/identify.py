@@ -28,7 +28,7 @@ from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
 from tdhil.estimation.time_domain.solve import Solved, solve
 from tdhil.estimation.time_domain.stick_slip import refuse_stick_slip
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, place_windows, runs, thinned
-from tdhil.recording import BoolArray, FloatArray, Recording
+from tdhil.recording import FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Kind of motion in a recording, in words, so that a refusal names the missing part.
@@ -137,26 +137,19 @@ def cut_off(signal: FloatArray, quantum: float) -> float | None:
         there = np.concatenate([[False], at, [False]])
         edges = np.flatnonzero(there[1:] != there[:-1]).reshape(-1, 2)
         plateaus = edges[edges[:, 1] - edges[:, 0] >= _ALIKE]
-        if share > _FLAT_SHARE and len(plateaus) and _lively_beside(signal, at, plateaus, quantum):
+        if not (share > _FLAT_SHARE and len(plateaus)):
+            continue
+        # Scatter beside the plateaus, by second differences: a ramp has none; for white noise they are √3 of the first
+        # differences. Samples at the extreme are left out.
+        beside = np.zeros(len(signal), dtype=np.bool_)
+        for begin, end in plateaus.tolist():
+            beside[max(begin - _BESIDE, 0) : end + _BESIDE] = True
+        clear = beside & ~at
+        whole = np.flatnonzero(clear[:-2] & clear[1:-1] & clear[2:])
+        wobble = np.abs(signal[whole] - 2.0 * signal[whole + 1] + signal[whole + 2])
+        if len(whole) and float(np.median(wobble)) > math.sqrt(3.0) * _LIVELY * quantum:
             return share
     return None
-
-
-def _lively_beside(signal: FloatArray, at: BoolArray, plateaus: IntArray, quantum: float) -> bool:
-    """Return whether samples next to the plateaus [begin, end) scatter by more than rounding on a ramp would cause.
-
-    Uses second differences: a ramp has none; for white noise they are √3 of the first differences. Samples at the
-    extreme are left out.
-    """
-    beside = np.zeros(len(signal), dtype=np.bool_)
-    for begin, end in plateaus.tolist():
-        beside[max(begin - _BESIDE, 0) : end + _BESIDE] = True
-    clear = beside & ~at
-    whole = np.flatnonzero(clear[:-2] & clear[1:-1] & clear[2:])
-    if len(whole) == 0:
-        return False
-    wobble = np.abs(signal[whole] - 2.0 * signal[whole + 1] + signal[whole + 2])
-    return float(np.median(wobble)) > math.sqrt(3.0) * _LIVELY * quantum
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -54,35 +54,30 @@ def local_test(problem: FitProblem, theta: FloatArray, factor: float) -> Residua
     ``factor``: scatter of the inertia over time, relative to the noise model. Noise that comes with the motion is
     common to many bins, so F is divided by factor², and its degrees of freedom are halved.
     """
-    tests = (_local_test(problem, theta, factor, group) for group in _GROUPS)
-    return next((test for test in tests if test is not None), None)
-
-
-def _local_test(problem: FitProblem, theta: FloatArray, factor: float, group: int) -> ResidualTest | None:
     found = evaluate(theta, problem.bins)
     bins, variance = problem.bins, problem.variance
-    by_model, by_line, dof_model, dof_line = 0.0, 0.0, 0, 0
-    for number in np.unique(bins.window):
-        mine = np.flatnonzero((bins.window == number) & (bins.hertz > 0.0))[_FIRST - 1 :]
-        for first in range(0, len(mine) - group + 1, group):
-            part = mine[first : first + group]
-            weight = 1.0 / np.sqrt(variance[part])
-            s = bins.s[part]
-            lines = np.stack([bins.speed[part, 0],
-                              bins.speed[part, 1] + (s - s.mean()) * bins.speed[part, 0]], axis=1)
-            u, _ = np.linalg.qr(lines * weight[:, None])
-            error = found.error[part] * weight
-            left = error - u @ (u.conj().T @ error)
-            by_model += 2.0 * float(np.sum(np.abs(error) ** 2))
-            by_line += 2.0 * float(np.sum(np.abs(left) ** 2))
-            dof_model += 2 * group
-            dof_line += 2 * (group - 2)
-    fitted = len(problem.free)
-    extra = dof_model - fitted - dof_line
-    if dof_line < 8 or extra < 2 or by_line <= 0.0:
-        return None
-    statistic = (by_model - by_line) / extra / (by_line / dof_line) / factor**2
-    return ResidualTest(float(statistic), float(extra), fisher_tail(float(statistic), extra, 0.5 * dof_line))
+    for group in _GROUPS:
+        by_model, by_line, dof_model, dof_line = 0.0, 0.0, 0, 0
+        for number in np.unique(bins.window):
+            mine = np.flatnonzero((bins.window == number) & (bins.hertz > 0.0))[_FIRST - 1 :]
+            for first in range(0, len(mine) - group + 1, group):
+                part = mine[first : first + group]
+                weight = 1.0 / np.sqrt(variance[part])
+                s = bins.s[part]
+                lines = np.stack([bins.speed[part, 0],
+                                  bins.speed[part, 1] + (s - s.mean()) * bins.speed[part, 0]], axis=1)
+                u, _ = np.linalg.qr(lines * weight[:, None])
+                error = found.error[part] * weight
+                left = error - u @ (u.conj().T @ error)
+                by_model += 2.0 * float(np.sum(np.abs(error) ** 2))
+                by_line += 2.0 * float(np.sum(np.abs(left) ** 2))
+                dof_model += 2 * group
+                dof_line += 2 * (group - 2)
+        extra = dof_model - len(problem.free) - dof_line
+        if not (dof_line < 8 or extra < 2 or by_line <= 0.0):
+            statistic = float((by_model - by_line) / extra / (by_line / dof_line) / factor**2)
+            return ResidualTest(statistic, float(extra), fisher_tail(statistic, extra, 0.5 * dof_line))
+    return None
 
 
 # ---------------------------------------------------------------------------------------------------------------------

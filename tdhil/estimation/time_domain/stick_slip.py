@@ -13,7 +13,7 @@ import numpy as np
 from profiles import MessageCode
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples
-from tdhil.recording import BoolArray, FloatArray
+from tdhil.recording import FloatArray
 
 _STILL_SHARE = 0.02       # of the highest speed: a lower speed counts as standstill
 _STILL_QUANTA = 3.0       # resolution steps of the reported speed: a lower speed also counts as standstill
@@ -71,7 +71,9 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
             continue
         between += 1
         way = float(np.sign(jump[np.argmax(np.abs(jump))]))
-        if way != _way_before(speed, still, first):
+        stops = np.flatnonzero(still[:first])
+        before = speed[int(stops[-1]) + 1 if len(stops) else 0 : first]
+        if way != (float(np.sign(before[np.argmax(np.abs(before))])) if len(before) else 0.0):
             continue      # a speed loop that reverses the shaft also integrates at standstill, for a moment
         rise = _rise(samples.time_s[first:last], way * torque[first:last])
         if rise > max(_LEAST_RISE * span, 2.0 * torque_quantum):
@@ -79,14 +81,6 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
     if len(rises) < _LEAST_JUMPS or len(rises) < _MOST_JUMPS_APART * between:
         return None
     return StickSlip(len(rises), float(np.mean(still)), float(np.median(rises)))
-
-
-def _way_before(speed: FloatArray, still: BoolArray, first: int) -> float:
-    """Return the direction of rotation before the standstill that begins with sample ``first``, ±1."""
-    stops = np.flatnonzero(still[:first])
-    begun = int(stops[-1]) + 1 if len(stops) else 0
-    moving = speed[begun:first]
-    return float(np.sign(moving[np.argmax(np.abs(moving))])) if len(moving) else 0.0
 
 
 def _rise(time: FloatArray, torque: FloatArray) -> float:

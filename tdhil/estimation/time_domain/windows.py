@@ -79,7 +79,11 @@ def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[OneWa
     time, speed = samples.time_s, samples.speed_rad_s
     still = max(_STILL_SHARE * float(np.max(np.abs(speed))), _STILL_QUANTA * speed_quantum)
     moving = np.abs(speed) > still
-    moving &= ~_before_stops(time, moving, hidden_s)
+    ends = time[np.flatnonzero(moving[:-1] & ~moving[1:]) + 1]
+    if len(ends):      # samples shortly before the end of reported motion
+        following = np.searchsorted(ends, time)
+        until = np.where(following < len(ends), ends[np.minimum(following, len(ends) - 1)] - time, math.inf)
+        moving &= ~(until <= hidden_s)
     sign = np.where(moving, np.sign(speed), 0.0)
     interval = float(np.median(np.diff(time)))
     longest = max(_GAP_STEPS * interval, _GAP_S)
@@ -91,16 +95,6 @@ def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[OneWa
             part = Samples(time[first:last], speed[first:last], samples.torque_nm[first:last])
             found.append(OneWayStretch(part, float(sign[first])))
     return tuple(found)
-
-
-def _before_stops(time: FloatArray, moving: BoolArray, hidden_s: float) -> BoolArray:
-    """Return True for the samples within ``hidden_s`` before the end of reported motion."""
-    ends = time[np.flatnonzero(moving[:-1] & ~moving[1:]) + 1]
-    if len(ends) == 0:
-        return np.zeros(len(time), dtype=np.bool_)
-    following = np.searchsorted(ends, time)
-    until = np.where(following < len(ends), ends[np.minimum(following, len(ends) - 1)] - time, math.inf)
-    return np.asarray(until <= hidden_s, dtype=np.bool_)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -191,28 +185,22 @@ def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[TaperWindow, ...]:
         count = max(1, math.ceil((length - taper) / _LONGEST_S))
         hop = (length - taper) / count
         finer = math.ceil(_OF_TAPER * length / (taper * len(run.samples)))
-        fine = _interpolated(run, finer) if finer > 1 else run
+        fine, samples = run, run.samples
+        if finer > 1:
+            from scipy.interpolate import CubicSpline
+
+            # on an even grid; in the band that is used the error of a spline is 0.5 % at most, equal for both signals
+            start, step = float(samples.time_s[0]), np.diff(samples.time_s)
+            knots = np.concatenate([[True], step >= _COINCIDENT * np.median(step)])
+            both = np.column_stack([samples.speed_rad_s, samples.torque_nm])[knots]
+            even = np.linspace(0.0, float(samples.time_s[knots][-1]) - start, finer * (len(samples) - 1) + 1)
+            splines = CubicSpline(samples.time_s[knots] - start, both)(even)
+            fine = replace(run, samples=Samples(even + start, splines[:, 0], splines[:, 1]))
         for number in range(count):
             window = TaperWindow(run, float(run.samples.time_s[0]) + number * hop, hop, taper, len(placed))
             if len(window.part(0.0, hop + taper)) >= _LEAST_SAMPLES:
                 placed.append(replace(window, run=fine, finer=finer))
     return tuple(placed)
-
-
-def _interpolated(run: OneWayStretch, finer: int) -> OneWayStretch:
-    """Return the run on an even grid, ``finer`` times as many samples, by cubic splines.
-
-    In the band that is used the error of a spline is 0.5 % at most, and equal for both signals.
-    """
-    from scipy.interpolate import CubicSpline
-
-    samples = run.samples
-    start, step = float(samples.time_s[0]), np.diff(samples.time_s)
-    knots = np.concatenate([[True], step >= _COINCIDENT * np.median(step)])
-    both = np.column_stack([samples.speed_rad_s, samples.torque_nm])[knots]
-    even = np.linspace(0.0, float(samples.time_s[knots][-1]) - start, finer * (len(samples) - 1) + 1)
-    fine = CubicSpline(samples.time_s[knots] - start, both)(even)
-    return replace(run, samples=Samples(even + start, fine[:, 0], fine[:, 1]))
 
 
 def measure(window: TaperWindow) -> Bins:
