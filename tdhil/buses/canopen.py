@@ -314,18 +314,11 @@ def parse_link(text: str, channel: str) -> tuple[bool, int | None]:
 
     Unexpected text counts as up and without a rate: opening the bus will show the cause.
     """
-    try:
-        links = json.loads(text)
-    except (ValueError, RecursionError):
+    link = _link(text, channel)
+    if link is None:
         return True, None
-    for link in links if isinstance(links, list) else []:
-        if isinstance(link, dict) and link.get("ifname") == channel:
-            flags = link.get("flags")
-            rate: Any = link
-            for key in ("linkinfo", "info_data", "bittiming", "bitrate"):
-                rate = rate.get(key) if isinstance(rate, dict) else None
-            return not isinstance(flags, list) or "UP" in flags, rate if isinstance(rate, int) and rate > 0 else None
-    return True, None
+    flags, rate = link.get("flags"), _below(link, "linkinfo", "info_data", "bittiming").get("bitrate")
+    return not isinstance(flags, list) or "UP" in flags, rate if isinstance(rate, int) and rate > 0 else None
 
 
 def read_link(channel: str) -> str | None:

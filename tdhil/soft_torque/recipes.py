@@ -71,7 +71,8 @@ def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[T
     if asked is not None and asked >= softest:
         raise TuningRefused(
             f"a = {asked:.2g} is beyond ζ/(ω² J Στ) = {softest:.2g}: with {_lag_ms(case)} of lag in the loop and the "
-            f"string's lowest mode at {held[0]:.3g} Hz the drive would amplify slow oscillations", where=f"--a {asked:g}",
+            f"string's lowest mode at {held[0]:.3g} Hz the drive would amplify slow oscillations",
+            where=f"--a {asked:g}",
             next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
     grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], (0.0,),
                                       SOFTNESSES if asked is None else (asked,))
