@@ -69,8 +69,8 @@ def test_the_course_is_laid_where_the_shaft_can_bear_it():
 
 @pytest.mark.parametrize(("window", "said"), [
     (replace(WINDOW, torque_nm=5000.0), "of the motor, and its limit"),
-    (replace(WINDOW, lowest_rad_s=4.0), "swings down"),
-    (replace(WINDOW, highest_rad_s=9.0), "swings up"),
+    (replace(WINDOW, lowest_rad_s=4.0), "the top falls to"),
+    (replace(WINDOW, highest_rad_s=9.0), "the top reaches"),
 ], ids=["torque", "low", "high"])
 def test_a_window_without_room_is_refused(window, said):
     with pytest.raises(EvaluationRefused, match=said):
