@@ -11,11 +11,11 @@ from drivers.errors import CommunicationLost, DriveFault
 from tdhil.config.rig import load_rig, simulated_default_rig
 from tdhil.errors import exit_code
 from tdhil.runner import preconditions
-from tdhil.runner.settings import ExcitationRequest, MachineLimits
+from tdhil.runner.settings import ExcitationRequest
 from tdhil.session.confirm import motion_summary
 from tdhil.session.task import machine_limits
+from tests.rigs import LIMITS, rig_file
 
-LIMITS = MachineLimits(0.5, 10.0, 400.0, 900.0)
 ACTS = "Check the cable; the drive's own watchdog stops the shaft"
 
 
@@ -40,11 +40,9 @@ def test_it_is_not_the_default_and_no_file_says_it(tmp_path: Path) -> None:
     assert not LIMITS.accept_no_watchdog
     assert not machine_limits(simulated_default_rig()).accept_no_watchdog
     assert machine_limits(simulated_default_rig(), accept_no_watchdog=True).accept_no_watchdog
-    rig = tmp_path / "rig.yaml"
     for text in ("accept_no_watchdog: true\n", "run: {accept_no_watchdog: true}\n"):
-        rig.write_text(text)
         with pytest.raises(Exception, match=r"rig\.yaml:1: .*accept_no_watchdog"):
-            load_rig(rig)
+            load_rig(rig_file(tmp_path, text))
 
 
 @pytest.mark.parametrize("found", [None, preflight(0.5)])

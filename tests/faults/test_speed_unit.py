@@ -23,14 +23,11 @@ from sim_bus.params import RigParams
 from tdhil.errors import exit_code
 from tdhil.runner import speed_check
 from tdhil.runner.five_stages import Runner
-from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.task import Task
+from tests.rigs import LIMITS
 from tests.runner.fake_drive import FakeDisplay, FakeLog
 
-LIMITS = MachineLimits(
-    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,
-    probe_torque_nm=200.0,
-)
 RATE_HZ = 100.0
 """Cycles per second on CANopen. What these tests judge takes seconds."""
 

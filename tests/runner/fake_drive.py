@@ -14,14 +14,11 @@ from tdhil.runner.guard import Guard
 from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
 from tdhil.runner.stop import StopSequence
 from tdhil.runner.task import Task
+from tests.rigs import LIMITS
 
 PERIOD_S = 0.02
 SPEED_RESOLUTION = 0.01
 TORQUE_RESOLUTION = 1.0
-LIMITS = MachineLimits(
-    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,
-    probe_torque_nm=200.0,
-)
 NAN = float("nan")
 
 Misbehaviour = Callable[["FakeDrive", Sample], Sample]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,14 +12,15 @@ from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerS
 from sim_bus.inverter import RPM, Inverter
 from sim_bus.params import RigParams
 from tdhil.runner.five_stages import Runner
-from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.task import Task
 from tdhil.session.conclusion import conclude
+from tests import rigs
 from tests.runner.fake_drive import FakeDisplay
 from tests.runner.line_drive import BuilderLog
 
 TRUE_KG_M2 = 104.0
-LIMITS = MachineLimits(0.5, 10.0, 400.0, 3600.0, probe_torque_nm=200.0)
+LIMITS = replace(rigs.LIMITS, time_s=3600.0)
 
 
 class InverterDrive:

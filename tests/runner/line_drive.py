@@ -22,13 +22,8 @@ from tdhil.recording.recording import Recording
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
 from tdhil.runner.task import RunOutcome, Task
+from tests.rigs import DRIVE_LIMITS, LIMITS
 from tests.runner.fake_drive import FakeDisplay
-
-RIG_LIMITS = MachineLimits(
-    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,
-    probe_torque_nm=200.0,
-)
-
 
 COARSE = RigParams(drive=DriveParams(control_period_s=0.005))
 """The default rig in steps of 5 ms: a run takes less than half the time."""
@@ -71,7 +66,7 @@ class LineDrive:
         self._plant_s = 0.0
         self._slot_s = 0.0
         self._state = self._wish = PowerState.OFF
-        self._limits = DriveLimits(10.0, 400.0, 2.0, 0.5)
+        self._limits = DRIVE_LIMITS
         self._mode: Mode = Mode.SPEED
 
     @property
@@ -224,7 +219,7 @@ class LineRun:
 
 
 def run_line(
-    drive: LineDrive, request: ExcitationRequest | None = None, limits: MachineLimits = RIG_LIMITS
+    drive: LineDrive, request: ExcitationRequest | None = None, limits: MachineLimits = LIMITS
 ) -> LineRun:
     """All five stages over the line."""
     log, display = BuilderLog(), FakeDisplay()

@@ -18,12 +18,9 @@ from drivers import Command, Mode, PowerState, Sample
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.observer import Observer
 from tdhil.runner.settings import MachineLimits
+from tests.rigs import LIMITS
 
 STEP_S = 0.002
-LIMITS = MachineLimits(
-    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,
-    probe_torque_nm=200.0,
-)
 
 
 class Reports(NamedTuple):

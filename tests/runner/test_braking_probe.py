@@ -10,7 +10,7 @@ from tdhil.errors import ExitCode, exit_code
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.stages.braking_probe import NOT_YET
 from tests.runner.fake_drive import LIMITS, FakeDrive
-from tests.runner.line_drive import RIG_LIMITS, Line, LineDrive, run_line
+from tests.runner.line_drive import Line, LineDrive, run_line
 
 MISREAD = {
     "unsigned": lambda torque: torque if torque >= 0.0 else 400.0,        # a large number, held by the torque limit
@@ -69,7 +69,7 @@ def test_through_lags_and_noise(how, rate_hz, seed):
     assert isinstance(run.outcome.cause, PreflightRefused), run.outcome.cause
     assert SAID[how] in str(run.outcome.cause)
     assert run.outcome.stop.confirmed
-    assert run.drive.top_rad_s < 0.8 * RIG_LIMITS.speed_max_rad_s
+    assert run.drive.top_rad_s < 0.8 * LIMITS.speed_max_rad_s
     assert all(abs(speed) < 0.05 for speed in run.drive.disabled_at)
 
 

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.drive import DriveLimits, Mode
+from drivers.drive import Mode
 from drivers.errors import PreflightRefused
 from tdhil.runner.preconditions import choose_mode
 from tdhil.runner.settings import ExcitationRequest
+from tests.rigs import DRIVE_LIMITS
 from tests.runner.fake_drive import LIMITS, FakeDrive
 
 ANY, TORQUE = ExcitationRequest(), ExcitationRequest(mode="torque")
@@ -15,7 +16,7 @@ STRING = replace(LIMITS, load="string")
 
 
 def preflight(brakes: bool, displays: bool):
-    found = FakeDrive(quick_stop_in_torque_mode=brakes).preflight(DriveLimits(10.0, 400.0, 2.0, 0.5))
+    found = FakeDrive(quick_stop_in_torque_mode=brakes).preflight(DRIVE_LIMITS)
     return replace(found, displays_mode=displays)
 
 

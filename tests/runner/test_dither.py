@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from tdhil.runner.excitation import MotionLimits, RigGuess, make_plan
 from tdhil.runner.guard import Guard
-from tdhil.runner.settings import ControlAssumptions, MachineLimits
+from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stages.acquire import dither, dither_peak
+from tests.rigs import LIMITS
 
 RPM = 2.0 * math.pi / 60.0
 
@@ -38,11 +39,10 @@ def test_no_period_of_the_excitation_meets_it_at_the_same_place():
     period_s=st.sampled_from([0.004, 1.0 / 15.0, 0.1]),
 )
 def test_the_guard_of_a_slow_line_lets_a_plan_in_torque_mode_through(inertia, coulomb, viscous, period_s):
-    limits = MachineLimits(speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0)
     assumptions = ControlAssumptions().at_period(period_s)
     guess = RigGuess(inertia, viscous, coulomb)
     plan = make_plan(MotionLimits(0.5, 10.0, 400.0, Guard.foresight_s(assumptions)), guess)
-    guard = Guard(limits, period_s, 1e-3, 0.1, ControlAssumptions())
+    guard = Guard(LIMITS, period_s, 1e-3, 0.1, ControlAssumptions())
     for segment in plan.segments:
         for step in range(0, 400):
             speed, torque = segment.reference.reference(segment.duration_s / segment.periods * step / 400)

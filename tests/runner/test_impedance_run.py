@@ -12,7 +12,7 @@ from tdhil.errors import Interrupted
 from tdhil.estimation import Verdict, identify
 from tdhil.runner.preconditions import choose_mode, refuse_slow_reference
 from tdhil.runner.settings import ExcitationRequest
-from tests.runner.line_drive import RIG_LIMITS, Line, LineDrive, run_line
+from tests.runner.line_drive import LIMITS, Line, LineDrive, run_line
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
 
@@ -65,7 +65,7 @@ def test_what_the_shaft_does_is_what_was_planned(measured):
     speed = measured.recording.speed_rad_s[excited & ended]
     assert plan.speed_min_rad_s - 0.2 < speed.min() and speed.max() < plan.speed_max_rad_s + 0.2
     assert plan.speed_max_rad_s - plan.speed_min_rad_s < 2.5 * np.ptp(speed)
-    assert np.max(np.abs(measured.recording.torque_nm)) < RIG_LIMITS.torque_nm
+    assert np.max(np.abs(measured.recording.torque_nm)) < LIMITS.torque_nm
 
 
 @pytest.mark.heavy
@@ -154,10 +154,10 @@ def test_an_interrupt_takes_it_away_as_well():
 @pytest.mark.parametrize(
     ("request_", "limits", "words"),
     [
-        (replace(OFFSET, mode="torque"), RIG_LIMITS, "speed loop"),
-        (OFFSET, replace(RIG_LIMITS, load="string"), "without a load"),
-        (replace(OFFSET, kind="sine"), RIG_LIMITS, "chooses its excited frequencies itself"),
-        (replace(OFFSET, frequency_hz=0.2), RIG_LIMITS, "chooses its excited frequencies itself"),
+        (replace(OFFSET, mode="torque"), LIMITS, "speed loop"),
+        (OFFSET, replace(LIMITS, load="string"), "without a load"),
+        (replace(OFFSET, kind="sine"), LIMITS, "chooses its excited frequencies itself"),
+        (replace(OFFSET, frequency_hz=0.2), LIMITS, "chooses its excited frequencies itself"),
     ],
 )
 def test_what_it_can_not_be_measured_with_is_refused(request_, limits, words):
@@ -176,7 +176,7 @@ def test_a_reference_that_comes_in_slow_steps_is_refused():
 
 @pytest.mark.heavy
 def test_too_little_time_is_refused_before_the_offset_grows():
-    short = run_line(drive(), OFFSET, replace(RIG_LIMITS, time_s=220.0))
+    short = run_line(drive(), OFFSET, replace(LIMITS, time_s=220.0))
     assert isinstance(short.outcome.cause, LimitHit)
     assert "too few" in str(short.outcome.cause)
     assert max(map(abs, short.drive.offsets_nm)) <= 20.1

@@ -22,7 +22,7 @@ from tdhil.runner.stages.acquire import run_acquire
 from tdhil.runner.stages.hold import MeanSpeedControl
 from tdhil.runner.task import Task
 from tests.runner.fake_drive import FakeDisplay, FakeDrive
-from tests.runner.line_drive import RIG_LIMITS, BuilderLog, Line, LineDrive
+from tests.runner.line_drive import LIMITS, BuilderLog, Line, LineDrive
 
 PLAN = make_plan(MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(100.0, 8.0, 60.0), PlanRequest(periods=4))
 MOTION = Excitation("multisine", "torque", (Segment(0.0, 40.0, 10.0, 1, 3.0, (0.1,), (1.0,), (0.0,)),))
@@ -232,7 +232,7 @@ def test_it_is_asked_after_whole_periods_and_the_setpoints_are_the_same(world):
 def test_the_live_answer_is_the_final_one_on_the_same_samples():
     """The samples are those of the log up to then, and J is what a replay of so much of the log gives."""
     log, viewer, lengths = BuilderLog(), Viewer(), []
-    task = Task(RIG_LIMITS, ExcitationRequest(periods=5), {"torque_scale_rel_sd": 0.02})
+    task = Task(LIMITS, ExcitationRequest(periods=5), {"torque_scale_rel_sd": 0.02})
 
     def counted(recording, confidence):
         lengths.append(len(recording.time_s))

@@ -17,7 +17,8 @@ from tdhil.runner.excitation import MotionLimits, PlanRefused, RigGuess, plan_sp
 from tdhil.runner.excitation.pulses import CALM_S, TOTAL_S, coasting_s
 from tdhil.runner.planning import plan_acquisition
 from tdhil.runner.settings import ExcitationRequest
-from tests.runner.line_drive import RIG_LIMITS, Line, LineDrive, run_line
+from tests import rigs
+from tests.runner.line_drive import Line, LineDrive, run_line
 
 TRUE_KG_M2 = 104.0
 LIMITS = MotionLimits(0.5, 10.0, 400.0, 0.86)
@@ -110,7 +111,7 @@ def test_both_routes_tell_the_inertia(kind, rate_hz, mode, routes):
     run = run_line(LineDrive(Line(1.0 / rate_hz), seed=4), ExcitationRequest(kind, mode))
     assert run.outcome.cause is None, run.outcome.cause
     assert run.outcome.stop.confirmed
-    assert run.drive.top_rad_s < RIG_LIMITS.speed_max_rad_s
+    assert run.drive.top_rad_s < rigs.LIMITS.speed_max_rad_s
     assert run.recording.excitation.kind == kind
     (acquired,) = (stage for stage in run.recording.stages if stage.name == "acquire")
     time_s = run.recording.time_s
@@ -130,7 +131,7 @@ def test_coast_down_is_refused_before_motion_where_it_can_not_be():
     assert isinstance(outcome.cause, PreflightRefused)
     assert "no torque mode" in str(outcome.cause)
     assert outcome.stop is None
-    string = replace(RIG_LIMITS, load="string")
+    string = replace(rigs.LIMITS, load="string")
     outcome = run_line(LineDrive(Line(0.02)), ExcitationRequest("coast-down"), string).outcome
     assert isinstance(outcome.cause, PreflightRefused)
     assert "string" in str(outcome.cause)

@@ -10,9 +10,8 @@ from tdhil.runner.observer.momentum_balance import MomentumBalance
 from tdhil.runner.observer.points import Point
 from tdhil.runner.observer.position_way import ANGLE_WINDOW_S, PositionWay, Way
 from tdhil.runner.observer.shaft_bounds import ShaftBounds
-from tdhil.runner.settings import MachineLimits
+from tests.rigs import LIMITS
 
-LIMITS = MachineLimits(0.5, 10.0, 400.0, 900.0)
 WAY = Way(0, 0.0, 1.0)
 
 

@@ -11,7 +11,7 @@ from tdhil.estimation import identify
 from tdhil.estimation.result import Options, Verdict
 from tdhil.recording.builder import FACTS
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest
-from tests.runner.line_drive import COARSE, RIG_LIMITS, Line, LineDrive, run_line
+from tests.runner.line_drive import COARSE, LIMITS, Line, LineDrive, run_line
 
 TRUE_KG_M2 = 104.0
 SPEED_ONLY = frozenset({Mode.SPEED})
@@ -20,7 +20,7 @@ SPEED_ONLY = frozenset({Mode.SPEED})
 def identified(run):
     assert run.outcome.cause is None, run.outcome.cause
     assert run.outcome.stop.confirmed
-    assert run.drive.top_rad_s < RIG_LIMITS.speed_max_rad_s
+    assert run.drive.top_rad_s < LIMITS.speed_max_rad_s
     assert all(abs(speed) < 0.05 for speed in run.drive.disabled_at)
     return identify(run.recording, Options(tolerance=0.05))
 
@@ -74,7 +74,7 @@ def test_torque_read_in_step_with_a_stiff_drive_is_not_trusted():
         "speed_gain_nm_s_rad": 1500.0, "speed_integral_gain_nm_rad": 3000.0, "speed_filter_s": 0.0,
         "torque_limit_nm": 2000.0,
     })
-    limits = replace(RIG_LIMITS, torque_nm=2000.0)
+    limits = replace(LIMITS, torque_nm=2000.0)
     plain = ReportingParams(speed_lag_s=0.0, torque_lag_s=0.0)
     run = run_line(LineDrive(
         Line(0.1), params=RigParams(drive=stiff, reporting=plain), modes=SPEED_ONLY, seed=2,

@@ -21,6 +21,7 @@ from tdhil.runner.string_release import (
     StringRelease,
     StringReleaseLimits,
 )
+from tests.rigs import DRIVE_LIMITS
 from tests.runner.fake_drive import NAN, PERIOD_S, FakeDrive, lost, refused_check
 from tests.runner.string_drive import RESIDUAL_NM, STRING, StringWorld
 
@@ -402,9 +403,8 @@ REAL = Identity(1, 2, 3, 4, "real", simulated=False)
 
 
 def preflight_of(**change):
-    from drivers.drive import DriveLimits
 
-    found = FakeDrive().preflight(DriveLimits(10.0, 400.0, 2.0, 0.5))
+    found = FakeDrive().preflight(DRIVE_LIMITS)
     return replace(found, **change)
 
 

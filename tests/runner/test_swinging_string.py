@@ -15,7 +15,7 @@ from tdhil.estimation import RoughFriction
 from tdhil.recording import LagPrior
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.runner.excitation import RigGuess
-from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
+from tdhil.runner.settings import ControlAssumptions, ExcitationRequest
 from tdhil.runner.stage_planner import StagePlanner
 from tdhil.runner.stages.braking_probe import (
     Before,
@@ -31,13 +31,12 @@ from tdhil.runner.stages.speed import SpeedResult, inertia_before_echo
 from tdhil.runner.stages.steady import Swing, calm_string, is_stick_slip, swing_of, widest
 from tdhil.runner.string_release import SwingDamper
 from tdhil.runner.task import Task
+from tests import rigs
 from tests.runner.fake_drive import PERIOD_S, FakeDrive, FakeLog, World
 from tests.soft_torque.chain_in_time import recorded, reference_case
 
-LIMITS = MachineLimits(
-    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=4000.0, time_s=1800.0, quick_stop_rad_s2=1.0,
-    probe_torque_nm=2000.0, load="string", torque_ramp_nm_s=100.0,
-)
+LIMITS = replace(rigs.LIMITS, torque_nm=4000.0, time_s=1800.0, quick_stop_rad_s2=1.0, probe_torque_nm=2000.0,
+                 load="string", torque_ramp_nm_s=100.0)
 STEPS = 10
 
 

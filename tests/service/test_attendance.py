@@ -11,7 +11,7 @@ import pytest
 from drivers import Check, Command, Identity, Mode, Outcome, PowerState, PreflightRefused, Sample
 from tdhil.errors import Interrupted
 from tdhil.recording import Stage
-from tdhil.runner import ExcitationRequest, MachineLimits, StopRequest, Task
+from tdhil.runner import ExcitationRequest, StopRequest, Task
 from tdhil.service.attendance import (
     CODE_S,
     LEASE_S,
@@ -26,9 +26,10 @@ from tdhil.service.attendance import (
 )
 from tdhil.service.run_state import State, Status, now
 from tdhil.service.store import Store
+from tests.rigs import LIMITS
 from tests.service.conftest import wait_for
 
-TASK = Task(MachineLimits(0.5, 10.0, 400.0, 900.0, probe_torque_nm=200.0), ExcitationRequest())
+TASK = Task(LIMITS, ExcitationRequest())
 COMMAND = Command(Mode.TORQUE, 0.0, 50.0)
 SAMPLE = Sample(1.0, 0.0, 0.0, True, 3.0, 50.0, None, Mode.TORQUE, PowerState.ENABLED, False, False, 0)
 

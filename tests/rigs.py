@@ -1,0 +1,52 @@
+"""The rig of the tests, declared once: its limits for each reader, its files, its plant.
+
+It is the rig of the simulated drive: 0.5 to 10 rad/s, 400 N·m, 15 minutes. A test states only what differs from it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivers.drive import DriveLimits
+from sim_bus.params import FAITHFUL, QUIET, RigParams
+from tdhil.runner.settings import MachineLimits
+
+NUMBERS = {
+    "speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 400.0, "time_s": 900.0, "quick_stop_rad_s2": 2.0,
+    "watchdog_s": 0.5, "probe_torque_nm": 200.0, "probe_travel_rad": 3.0,
+}
+"""Limits by their keys in rig.yaml, SI at the motor shaft."""
+
+LIMITS = MachineLimits(**NUMBERS)
+"""The limits as the runner gets them."""
+
+DRIVE_LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
+"""The limits as a drive gets them."""
+
+QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
+"""The simulated drive and shaft without noise, lag and rounding."""
+
+STRING = "load: string\nmake_up_torque_nm: 29000\ntorque_ramp_nm_s: 400\n"
+"""Keys of rig.yaml for a drill string on the shaft."""
+
+
+def limits_text(**changes: object) -> str:
+    """Return the section `limits` of a rig.yaml, a line for each key. A key that is None is left out."""
+    lines = [f"  {key}: {value}\n" for key, value in {**NUMBERS, **changes}.items() if value is not None]
+    return "".join(["limits:\n", *lines])
+
+
+PATIENT = limits_text(watchdog_s=5.0)
+"""For real time on a busy computer: a loop may pause for half of the watchdog's time."""
+
+
+def rig_file(folder: Path, *parts: str, name: str = "rig.yaml") -> Path:
+    """Write a rig.yaml of these parts, and return its path."""
+    path = folder / name
+    path.write_text("".join(parts), encoding="utf-8")
+    return path
+
+
+def plant_file(folder: Path, *parts: str) -> Path:
+    """Write a plant.yaml of these parts, and return its path."""
+    return rig_file(folder, *parts, name="plant.yaml")
