@@ -144,6 +144,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         Path(write_to).write_text(json.dumps(groups))
 
 
+@pytest.fixture
+def no_bus_of_the_user(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Neither the environment nor the files of the user who runs the tests name a bus."""
+    for name in [name for name in os.environ if name.startswith("CAN_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+
+
 STOOD_STILL_S = 0.5
 LATE = ("stood still for", "host or adapter late", "host was silent for too long")
 """Of what a run says at its end (drivers)."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from drivers.drive import DriveLimits
 from sim_bus.params import FAITHFUL, QUIET, RigParams
+from tdhil.config.rig import Rig, load_rig
 from tdhil.runner.settings import MachineLimits
 
 NUMBERS = {
@@ -45,6 +46,11 @@ def rig_file(folder: Path, *parts: str, name: str = "rig.yaml") -> Path:
     path = folder / name
     path.write_text("".join(parts), encoding="utf-8")
     return path
+
+
+def loaded_rig(folder: Path, *parts: str) -> Rig:
+    """Return the rig of a rig.yaml of these parts. Raises DataFileError as its reader does."""
+    return load_rig(rig_file(folder, *parts))
 
 
 def plant_file(folder: Path, *parts: str) -> Path:

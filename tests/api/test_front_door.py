@@ -20,6 +20,7 @@ from tdhil.cli.main import main
 from tdhil.errors import Interrupted, UsageError
 from tdhil.session.confirm import CallbackOperator, TerminalOperator
 from tdhil.session.stop_signals import stop_on_signals
+from tests.rigs import rig_file
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
 
@@ -142,8 +143,7 @@ def test_what_can_t_be_is_said_when_the_drive_is_named(wrong, said):
     ({"real_time": True, "stepped": True}, "stepped"),
 ])
 def test_an_option_is_named_as_python_calls_it(tmp_path, wrong, said):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("run: {seed: 7}\n")
+    rig = rig_file(tmp_path, "run: {seed: 7}\n")
     with pytest.raises(UsageError) as caught, tdhil.open_drive(rig, **wrong):
         pass
     assert said in str(caught.value) and f"--{said[:4]}" not in str(caught.value)
@@ -167,8 +167,7 @@ def test_values_that_can_t_be_are_named_as_python_calls_them(record, tmp_path, c
 
 
 def test_a_drive_is_named_without_a_motion_being_planned(tmp_path):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("run: {amplitude_rad_s: 50.0}\n")             # no motion of this bench fits its limits
+    rig = rig_file(tmp_path, "run: {amplitude_rad_s: 50.0}\n")             # no motion of this bench fits its limits
     with tdhil.simulate(rig=rig) as drive, pytest.raises(PreflightRefused, match="plan of stage 5"):
         tdhil.run(drive, tdhil.Multisine())
     with tdhil.open_drive(rig, simulate=True) as drive:

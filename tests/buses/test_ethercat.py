@@ -15,6 +15,7 @@ from tdhil.cli.main import main
 from tdhil.config.rig import load_rig
 from tdhil.errors import UsageError
 from tests.drivers.fake_soem import FakeMaster, FakeSlave
+from tests.rigs import loaded_rig
 
 STILL = RigParams(noise=QUIET, reporting=FAITHFUL)
 
@@ -35,11 +36,7 @@ def segment(monkeypatch):
 
 
 def line_of(cli, text=None, tmp_path=None):
-    rig = None
-    if text is not None:
-        path = tmp_path / "rig.yaml"
-        path.write_text(text)
-        rig = load_rig(path)
+    rig = None if text is None else loaded_rig(tmp_path, text)
     return {name: value for name, value, _ in ethercat.ETHERCAT.line(cli, rig, None).rows()}
 
 
@@ -53,10 +50,8 @@ def test_the_command_line_goes_before_the_rig(tmp_path):
 
 
 def test_a_rig_with_two_addresses_of_one_drive_is_refused(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text("ethercat: {interface: eth1, position: 0, alias: 5}\n")
     with pytest.raises(DataFileError, match="position and alias name one drive twice"):
-        load_rig(path)
+        loaded_rig(tmp_path, "ethercat: {interface: eth1, position: 0, alias: 5}\n")
 
 
 def test_position_chooses_the_bus_and_the_interface_is_its_own(capsys, segment):

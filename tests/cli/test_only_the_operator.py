@@ -2,40 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from drivers.errors import DataFileError, PreflightRefused
 from tdhil.cli.main import main
 from tdhil.config.options import RESOLVED
 from tdhil.config.resolution import resolve
-from tdhil.config.rig import load_rig
 from tdhil.session.confirm import confirm_motion
-
-LIMITS = """\
-limits:
-  speed_min_rad_s: 0.5
-  speed_max_rad_s: 10
-  torque_nm: 400
-  time_s: 900
-  quick_stop_rad_s2: 2
-  probe_torque_nm: 200
-  probe_travel_rad: 3
-"""
-
-
-def rig(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text, encoding="utf-8")
-    return path
+from tests.rigs import limits_text, loaded_rig, rig_file
 
 
 @pytest.mark.parametrize("value", ["true", "false"])
 def test_a_file_does_not_confirm(tmp_path, capsys, monkeypatch, value):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CI", "true")
-    path = rig(tmp_path, f"{LIMITS}run:\n  seed: 3\n  yes: {value}\n")
+    path = rig_file(tmp_path, limits_text(watchdog_s=None), f"run:\n  seed: 3\n  yes: {value}\n")
     assert main(["identify", "--rig", str(path), "-i", "socketcan", "-c", "can0"]) == 2
     said = capsys.readouterr().err
     assert "rig.yaml:11:" in said
@@ -51,7 +32,7 @@ def test_a_file_does_not_confirm(tmp_path, capsys, monkeypatch, value):
 ])
 def test_nothing_that_the_operator_answers_for_stands_in_a_file(tmp_path, section, key):
     with pytest.raises(DataFileError) as caught:
-        load_rig(rig(tmp_path, f"node: 3\n{section}{key}: true\n"))
+        loaded_rig(tmp_path, f"node: 3\n{section}{key}: true\n")
     (problem,) = caught.value.problems
     assert problem.line == (3 if section else 2)
     assert f"--{key.replace('_', '-')}" in problem.message
@@ -64,7 +45,7 @@ def test_no_option_takes_the_confirmation_from_a_rig():
 
 
 def test_an_override_in_a_file_is_for_the_profile_of_that_file(tmp_path):
-    bench = load_rig(rig(tmp_path, "profile: danfoss/fc302\naccept_unverified: [likely]\n"))
+    bench = loaded_rig(tmp_path, "profile: danfoss/fc302\naccept_unverified: [likely]\n")
     assert resolve({}, bench).accept_unverified == ("likely",)
     assert resolve({"profile": "danfoss/fc302"}, bench).accept_unverified == ("likely",)
     other = resolve({"profile": "abb/acs880-enhanced"}, bench)

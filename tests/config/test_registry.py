@@ -47,6 +47,7 @@ from tdhil.runner.settings import ExcitationRequest, MachineLimits
 from tests.estimation.compliant_bench import TwoMass, run
 from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
 from tests.estimation.test_two_mass import MILD
+from tests.rigs import loaded_rig, rig_file
 from tests.runner.test_design import KNOWN
 
 ROOT = Path(__file__).parents[2]
@@ -96,8 +97,7 @@ def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
 @pytest.mark.usefixtures("toys")
 @pytest.mark.parametrize(("kind", "motion"), [("two-tones", "segments"), ("stairs", "ways")])
 def test_a_toy_excitation_is_taken_by_the_command_line_and_rig_yaml(kind, motion, tmp_path, capsys):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(f"run: {{excitation: {kind}}}\n")
+    rig = rig_file(tmp_path, f"run: {{excitation: {kind}}}\n")
     assert load_rig(rig).run.excitation == kind
     for words in (["--excitation", kind], ["--rig", str(rig)]):
         assert main(["identify", "--simulate", "--dry-run", "--json", *words]) == 0
@@ -225,11 +225,9 @@ def test_a_wrong_name_is_refused_as_a_literal_is(registry, wrong):
 
 
 def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("run:\n  excitation: multisin\n")
     with pytest.raises(DataFileError, match=r"rig.yaml:2: run.excitation: must be 'multisine', .* or '[a-z-]+', "
                                             r"not the text 'multisin'; did you mean 'multisine'\?"):
-        load_rig(rig)
+        loaded_rig(tmp_path, "run:\n  excitation: multisin\n")
     wanted = r"^excitation: must be 'multisine', .* or '[a-z-]+', not"
     with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match=wanted):
         tdhil.run(drive, tdhil.Motion("noise"), log=tmp_path / "run.mcap")

@@ -8,9 +8,10 @@ from pydantic import ValidationError
 from drivers.errors import DataFileError, PreflightRefused
 from tdhil.config.options import OPTIONS
 from tdhil.config.resolution import resolve
-from tdhil.config.rig import Limits, Rig, load_rig, require_limits, simulated_default_rig
+from tdhil.config.rig import Limits, require_limits, simulated_default_rig
 from tdhil.errors import UsageError
 from tdhil.session.task import pipe_of
+from tests.rigs import loaded_rig
 
 FULL = """\
 drive: canopen
@@ -69,20 +70,14 @@ letterhead: letterhead.yaml
 """
 
 
-def rig_of(tmp_path: Path, text: str) -> Rig:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    return load_rig(path)
-
-
 def problems(tmp_path: Path, text: str) -> list[tuple[int, str]]:
     with pytest.raises(DataFileError) as caught:
-        rig_of(tmp_path, text)
+        loaded_rig(tmp_path, text)
     return [(problem.line, problem.message) for problem in caught.value.problems]
 
 
 def test_everything_has_its_place(tmp_path: Path) -> None:
-    rig = rig_of(tmp_path, FULL)
+    rig = loaded_rig(tmp_path, FULL)
     assert rig.limits is not None
     assert rig.limits.torque_nm == 400
     assert rig.run.json_ is True
@@ -93,7 +88,7 @@ def test_everything_has_its_place(tmp_path: Path) -> None:
 
 
 def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
-    rig = rig_of(tmp_path, "node: 3\n")
+    rig = loaded_rig(tmp_path, "node: 3\n")
     assert rig.limits is None
     assert (rig.gear.ratio, rig.load.kind, rig.allow_reverse) == (1.0, "none", False)
     with pytest.raises(ValidationError):
@@ -139,7 +134,7 @@ def test_problems_across_keys_come_together(tmp_path: Path) -> None:
 
 
 def test_a_real_drive_needs_limits(tmp_path: Path) -> None:
-    for rig in (None, rig_of(tmp_path, "node: 3\n")):
+    for rig in (None, loaded_rig(tmp_path, "node: 3\n")):
         with pytest.raises(PreflightRefused) as caught:
             require_limits(rig)
         assert "speed_max_rad_s" in str(caught.value)
@@ -150,21 +145,21 @@ def test_the_simulated_rig_needs_none(tmp_path: Path) -> None:
     limits = require_limits(simulated_default_rig())
     assert (limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm) == (0.5, 10.0, 400.0)
     assert simulated_default_rig().drive_data.torque_scale_rel_sd == 0.02
-    mine = simulated_default_rig(rig_of(tmp_path, FULL))
-    assert mine == rig_of(tmp_path, FULL)
+    mine = simulated_default_rig(loaded_rig(tmp_path, FULL))
+    assert mine == loaded_rig(tmp_path, FULL)
     assert mine.source("node") == "rig.yaml:3"
-    some = simulated_default_rig(rig_of(tmp_path, "node: 3\ndrive_data: {speed_lag_s: 0.1}\n"))
+    some = simulated_default_rig(loaded_rig(tmp_path, "node: 3\ndrive_data: {speed_lag_s: 0.1}\n"))
     assert (some.node, some.drive_data.speed_lag_s, require_limits(some)) == (3, 0.1, limits)
 
 
 def test_a_rig_that_the_simulated_limits_do_not_fit(tmp_path: Path) -> None:
-    rig = rig_of(tmp_path, "load: string\nmake_up_torque_nm: 300\ntorque_ramp_nm_s: 5\n")
+    rig = loaded_rig(tmp_path, "load: string\nmake_up_torque_nm: 300\ntorque_ramp_nm_s: 5\n")
     with pytest.raises(DataFileError, match="must be below make_up_torque_nm"):
         simulated_default_rig(rig)
 
 
 def test_command_line_before_rig_before_default(tmp_path: Path) -> None:
-    found = resolve({"node": 9, "seed": None}, rig_of(tmp_path, "node: 3\nrun:\n  seed: 7\n"))
+    found = resolve({"node": 9, "seed": None}, loaded_rig(tmp_path, "node: 3\nrun:\n  seed: 7\n"))
     assert (found.node, found.source("node")) == (9, "--node")
     assert (found.seed, found.source("seed")) == (7, "rig.yaml:3")
     assert (found.excitation, found.source("excitation")) == ("multisine", "default")
@@ -174,12 +169,12 @@ def test_command_line_before_rig_before_default(tmp_path: Path) -> None:
 
 
 def test_every_option_can_stand_in_the_rig(tmp_path: Path) -> None:
-    found = resolve({}, rig_of(tmp_path, FULL))
+    found = resolve({}, loaded_rig(tmp_path, FULL))
     assert all(found.source(option.name).startswith("rig.yaml:") for option in OPTIONS if option.at)
 
 
 def test_what_is_accepted_in_both_places_counts_once(tmp_path: Path) -> None:
-    rig = rig_of(tmp_path, "accept_unverified: [watchdog, likely]\n")
+    rig = loaded_rig(tmp_path, "accept_unverified: [watchdog, likely]\n")
     found = resolve({"accept_unverified": ["speed", "watchdog"]}, rig)
     assert found.accept_unverified == ("speed", "watchdog", "likely")
     assert found.source("accept_unverified") == "--accept-unverified and rig.yaml:1"
@@ -188,16 +183,16 @@ def test_what_is_accepted_in_both_places_counts_once(tmp_path: Path) -> None:
 
 
 def test_files_named_in_the_rig_lie_beside_it(tmp_path: Path) -> None:
-    found = resolve({}, rig_of(tmp_path, FULL))
+    found = resolve({}, loaded_rig(tmp_path, FULL))
     assert found.plant == str(tmp_path / "plant.yaml")
     assert found.profile == str(tmp_path / "mine.yaml")
     assert found.log == "here.mcap"
-    found = resolve({"plant": "p.yaml"}, rig_of(tmp_path, "profile: generic/cia402"))
+    found = resolve({"plant": "p.yaml"}, loaded_rig(tmp_path, "profile: generic/cia402"))
     assert (found.plant, found.profile) == ("p.yaml", "generic/cia402")
 
 
 def test_the_clock_of_the_command_line_undoes_the_rigs(tmp_path: Path) -> None:
-    found = resolve({"stepped": True}, rig_of(tmp_path, FULL))
+    found = resolve({"stepped": True}, loaded_rig(tmp_path, FULL))
     assert (found.stepped, found.real_time, found.source("real_time")) == (True, False, "--stepped")
 
 
@@ -226,9 +221,9 @@ STRING_KEYS = "make_up_torque_nm: 300\ntorque_ramp_nm_s: 5\n"
 
 
 def test_a_string_may_be_a_word_or_a_pipe_with_its_sizes(tmp_path):
-    assert rig_of(tmp_path, "load: string\n" + STRING_KEYS).load.kind == "string"
+    assert loaded_rig(tmp_path, "load: string\n" + STRING_KEYS).load.kind == "string"
     pipe = "load: {kind: string, length_m: 2300, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}\n"
-    load = rig_of(tmp_path, pipe + STRING_KEYS).load
+    load = loaded_rig(tmp_path, pipe + STRING_KEYS).load
     assert (load.kind, load.length_m, load.outer_diameter_m, load.inner_diameter_m) == ("string", 2300.0, 0.127, 0.1086)
     assert load.tolerance == 0.03
 
@@ -242,13 +237,13 @@ def test_a_string_may_be_a_word_or_a_pipe_with_its_sizes(tmp_path):
 ])
 def test_a_load_that_is_none_is_refused_with_its_line(load, said, tmp_path):
     with pytest.raises(DataFileError, match=said) as refused:
-        rig_of(tmp_path, f"node: 5\nload: {load}\n" + STRING_KEYS)
+        loaded_rig(tmp_path, f"node: 5\nload: {load}\n" + STRING_KEYS)
     assert "rig.yaml:2" in str(refused.value)
 
 
 def test_the_pipe_is_what_its_sizes_make_of_steel_at_the_motor(tmp_path):
     pipe = "load: {kind: string, length_m: 3000, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}\n"
-    found = pipe_of(rig_of(tmp_path, "gear: {ratio: 2}\n" + pipe + STRING_KEYS))
+    found = pipe_of(loaded_rig(tmp_path, "gear: {ratio: 2}\n" + pipe + STRING_KEYS))
     assert 4.0 * found.impedance_nm_s_rad == pytest.approx(296.5, rel=1e-3)
     assert 2.0 * found.delay_s == pytest.approx(1.888, rel=1e-3)
-    assert pipe_of(rig_of(tmp_path, "load: string\n" + STRING_KEYS)) is None
+    assert pipe_of(loaded_rig(tmp_path, "load: string\n" + STRING_KEYS)) is None

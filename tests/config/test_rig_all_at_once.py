@@ -8,18 +8,12 @@ from drivers.errors import DataFileError
 from tdhil.config.resolution import resolve
 from tdhil.config.rig import load_rig
 from tdhil.session.connection import connection_of
-
-LIMITS = {
-    "speed_min_rad_s": "0.5", "speed_max_rad_s": "10", "torque_nm": "400", "time_s": "900", "quick_stop_rad_s2": "2",
-    "watchdog_s": "0.5", "probe_torque_nm": "200", "probe_travel_rad": "3",
-}
+from tests.rigs import limits_text, loaded_rig
 
 
 def rig_text(limits=(), **top):
     """One line a key, so that each mistake has a line of its own; None takes a key out."""
-    lines = [f"{key}: {value}" for key, value in top.items()]
-    inside = {**LIMITS, **dict(limits)}
-    return "\n".join([*lines, "limits:", *(f"  {key}: {value}" for key, value in inside.items() if value)]) + "\n"
+    return "".join(f"{key}: {value}\n" for key, value in top.items()) + limits_text(**dict(limits))
 
 
 def problems(path, text):
@@ -111,13 +105,8 @@ OTHER_BUS = {
 
 
 @pytest.mark.parametrize("text", OTHER_BUS)
-def test_a_place_on_the_other_bus_is_no_wish_for_the_simulator(tmp_path, monkeypatch, text):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.delenv("CAN_INTERFACE", raising=False)
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    rig = load_rig(path)
+def test_a_place_on_the_other_bus_is_no_wish_for_the_simulator(tmp_path, no_bus_of_the_user, text):
+    rig = loaded_rig(tmp_path, text)
     with pytest.raises(DataFileError) as caught:
         connection_of({}, rig, resolve({}, rig))
     (problem,) = caught.value.problems
@@ -127,11 +116,7 @@ def test_a_place_on_the_other_bus_is_no_wish_for_the_simulator(tmp_path, monkeyp
     assert "--simulate" in problem.message
 
 
-def test_it_is_taken_where_somebody_says_what_is_meant(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "rig.yaml"
-    path.write_text("drive: canopen\nmodbus: {host: 192.0.2.10}\n")
-    rig = load_rig(path)
+def test_it_is_taken_where_somebody_says_what_is_meant(tmp_path, no_bus_of_the_user):
+    rig = loaded_rig(tmp_path, "drive: canopen\nmodbus: {host: 192.0.2.10}\n")
     for cli in ({"simulate": True}, {"drive": "modbus"}, {"interface": "virtual", "channel": "a"}):
         connection_of(cli, rig, resolve(cli, rig))

@@ -13,18 +13,11 @@ from tdhil.buses.canopen import CAN_BIT_RATES, bit_rate_problem
 from tdhil.cli.main import main
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
-
-LIMITS = {
-    "speed_min_rad_s": "0.5", "speed_max_rad_s": "10", "torque_nm": "400", "time_s": "900", "quick_stop_rad_s2": "2",
-    "watchdog_s": "0.5", "probe_torque_nm": "200", "probe_travel_rad": "3",
-}
+from tests.rigs import NUMBERS, limits_text, rig_file
 
 
-def rig(tmp_path: Path, limits: dict[str, str], more: str = "") -> Path:
-    path = tmp_path / "rig.yaml"
-    lines = [f"  {key}: {value}" for key, value in {**LIMITS, **limits}.items() if value]
-    path.write_text("\n".join(["limits:", *lines, more]) + "\n", encoding="utf-8")
-    return path
+def rig(tmp_path: Path, limits: dict[str, str | None], more: str = "") -> Path:
+    return rig_file(tmp_path, limits_text(**limits), more)
 
 
 @pytest.mark.parametrize(("key", "written", "value"), [
@@ -38,7 +31,7 @@ def test_a_value_with_its_unit_is_converted_and_both_are_told(tmp_path, key, wri
     ((said, text, source),) = bench.conversions
     assert said == f"limits.{key}"
     assert text.startswith(f"{written} = ")
-    assert source == f"rig.yaml:{list(LIMITS).index(key) + 2}"
+    assert source == f"rig.yaml:{list(NUMBERS).index(key) + 2}"
 
 
 @pytest.mark.parametrize(("ours", "key", "written", "value"), [
@@ -50,7 +43,7 @@ def test_a_value_with_its_unit_is_converted_and_both_are_told(tmp_path, key, wri
     ("speed_max_rad_s", "speed_max_rpm", "100 rpm", 10.471975511965978),
 ])
 def test_a_key_in_the_manual_s_unit(tmp_path, ours, key, written, value):
-    bench = load_rig(rig(tmp_path, {ours: "", key: written}))
+    bench = load_rig(rig(tmp_path, {ours: None, key: written}))
     assert bench.get(f"limits.{ours}") == pytest.approx(value, rel=1e-15)
     assert bench.line(f"limits.{ours}") == 9
     assert bench.conversions[0][0] == f"limits.{ours}"
@@ -58,8 +51,8 @@ def test_a_key_in_the_manual_s_unit(tmp_path, ours, key, written, value):
 
 @pytest.mark.parametrize(("limits", "more", "line", "words"), [
     ({"speed_max_rpm": "100"}, "", 10, "'speed_max_rpm' and 'speed_max_rad_s' (line 3) are the same quantity"),
-    ({"speed_max_rad_s": "", "speed_max_rpm": "100 rad/s"}, "", 9, "the key says rpm, the value rad/s"),
-    ({"speed_max_rad_s": "", "speed_max_rpm": "fast"}, "", 9, "must be a number in rpm"),
+    ({"speed_max_rad_s": None, "speed_max_rpm": "100 rad/s"}, "", 9, "the key says rpm, the value rad/s"),
+    ({"speed_max_rad_s": None, "speed_max_rpm": "fast"}, "", 9, "must be a number in rpm"),
     ({"speed_max_rad_s": "100 1/s"}, "", 3, "'1/s' is not a unit of speed"),
     ({"speed_max_rad_s": "15 min"}, "", 3, "min is a unit of time, not of speed"),
     ({"torque_nm": "50 %"}, "", 4, "% is a unit of share, not of torque"),

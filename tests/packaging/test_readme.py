@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from tdhil.cli.main import build_parser
-from tdhil.config.rig import load_rig, require_limits
+from tdhil.config.rig import require_limits
+from tests.rigs import loaded_rig
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -70,9 +71,7 @@ def _help_of(command: str) -> str:
 def test_rig_yaml_loads(tmp_path):
     page = ROOT / "docs" / "how-to" / "connect-a-canopen-drive.md"
     (text,) = blocks("yaml", page.read_text(encoding="utf-8"))
-    path = tmp_path / "rig.yaml"
-    path.write_text(text, encoding="utf-8")
-    assert require_limits(load_rig(path)).torque_nm == 400
+    assert require_limits(loaded_rig(tmp_path, text)).torque_nm == 400
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -21,11 +21,8 @@ from tdhil.session import starter
 from tests.path.path_runs import tdhil
 from tests.path.scan_lines_scripted import Answering, Garbled, Silent
 from tests.path.watched_bus import WatchedBus
+from tests.rigs import NUMBERS, rig_file
 
-LIMITS = {
-    "speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 400.0, "time_s": 900.0, "quick_stop_rad_s2": 2.0,
-    "probe_torque_nm": 200.0, "probe_travel_rad": 3.0,
-}
 pytestmark = pytest.mark.real_time         # who is asked has so long to answer, on the wall's clock
 QUICK = ("--listen", 0.5)
 
@@ -34,7 +31,7 @@ def filled(path):
     """The starter file as an engineer would complete it: '#' away, and a value behind each key."""
     text = re.sub(r"^#( *[a-z_0-9]+:)", r"\1", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
     text = re.sub(r"^(name:)", r"\1 bench 3", text, flags=re.MULTILINE)
-    for name, value in (LIMITS | {"torque_scale_rel_sd": 0.02, "rated_torque_nm": 1000.0}).items():
+    for name, value in (NUMBERS | {"torque_scale_rel_sd": 0.02, "rated_torque_nm": 1000.0}).items():
         text = re.sub(rf"^(  {name}:)", rf"\1 {value}", text, flags=re.MULTILINE)
     text = re.sub(r"^(    [a-z_0-9]+:)", r"\1 1.5", text, flags=re.MULTILINE)
     text = re.sub(r"^(profile:) +#", r"\1 generic/modbus    #", text, flags=re.MULTILINE)
@@ -103,8 +100,7 @@ def test_two_nodes_and_a_starter_for_one_of_them(tmp_path):
 
 
 def test_a_file_that_is_there_is_never_written_over(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text("node: 3\n")
+    path = rig_file(tmp_path, "node: 3\n")
     done = tdhil("scan", "--simulate", *QUICK, "--write", path)
     assert done.code == 2
     assert "not overwritten" in done.err

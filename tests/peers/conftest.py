@@ -54,11 +54,8 @@ def foxglove_program():
 
 
 @pytest.fixture(autouse=True)
-def no_bus_of_the_user(monkeypatch, tmp_path):
-    for name in [name for name in os.environ if name.startswith("CAN_")]:
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
+def _in_a_folder_of_its_own(no_bus_of_the_user):
+    pass
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -6,12 +6,13 @@ import pytest
 
 from drivers import DataFileError
 from profiles import CodedText, MessageCode
-from tdhil.config import Expectation, expectations_in, expectations_of, load_rig
+from tdhil.config import Expectation, expectations_in, expectations_of
 from tdhil.errors import ExitCode, UsageError
 from tdhil.estimation import Estimate
 from tdhil.report import acceptance_of, card_text, result_document
 from tdhil.session.conclusion import _accepted
 from tests.report.findings import RUN, bare, full, recording
+from tests.rigs import loaded_rig
 
 EXPECTED = {"inertia": (104.0, 5.0), "viscous": (8.0, 2.0), "coulomb": (60.0, 6.0), "speed-lag": (0.4, 0.05)}
 
@@ -153,13 +154,11 @@ def test_what_is_none_is_refused_by_name(given, words):
 
 
 def test_rig_yaml_states_them_and_the_command_line_goes_before(tmp_path):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: 0.4 s ± 50 ms\n")
-    found = expectations_of(load_rig(rig).acceptance, ("inertia=100±1",))
+    rig = loaded_rig(tmp_path, "acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: 0.4 s ± 50 ms\n")
+    found = expectations_of(rig.acceptance, ("inertia=100±1",))
     assert [(one.name, one.value) for one in found] == [("inertia", 100.0), ("speed-lag", 0.4)]
-    rig.write_text("acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: soon\n")
     with pytest.raises(DataFileError, match=r"rig.yaml:3.*tolerance"):
-        load_rig(rig)
+        loaded_rig(tmp_path, "acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: soon\n")
 
 
 def test_it_stands_in_document_and_card_and_a_log_may_say_anything():

@@ -15,8 +15,8 @@ import pytest
 from drivers.errors import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.buses import canopen
 from tdhil.buses.canopen import CanLine, can_line, check_link, open_bus, parse_link
-from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
+from tests.rigs import loaded_rig
 
 
 @pytest.fixture(autouse=True)
@@ -33,12 +33,6 @@ def cli(*words: str) -> dict[str, object]:
     parser = argparse.ArgumentParser()
     can.cli.add_bus_arguments(parser)
     return vars(parser.parse_args(words))
-
-
-def rig(tmp_path: Path, text: str) -> Rig:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    return load_rig(path)
 
 
 def test_no_can_lineured(files: tuple[Path, Path]) -> None:
@@ -65,7 +59,7 @@ def test_each_value_comes_from_the_first_place_that_names_it(
     assert (found.bitrate, found.source("bitrate")) == (500000, "CAN_BITRATE")
     assert found.kwargs() == can.util.load_config() | {"state": "ACTIVE"}
 
-    bench = rig(tmp_path, "bus:\n  channel: can7\n  options: {tcp_tune: true}\n")
+    bench = loaded_rig(tmp_path, "bus:\n  channel: can7\n  options: {tcp_tune: true}\n")
     found = can_line(cli("-i", "socketcan", "--bus-kwargs", "a=1"), bench)
     assert list(found.rows())[:3] == [
         ("interface", "socketcan", "--interface"),

@@ -12,6 +12,7 @@ from profiles import load_profile, profile_names
 from profiles.library import profile_path
 from tdhil.config import load_rig, resolve
 from tdhil.session import connection_of, connection_of_kept, kept_connection
+from tests.rigs import rig_file
 
 CANOPEN = ("bus: {interface: socketcan, channel: can3, bitrate: 250000, options: {receive_own_messages: false}}\n"
            "node: 17\n")
@@ -32,8 +33,7 @@ def kept(path: Path) -> tuple:
 def test_the_way_to_a_drive_comes_back_without_its_files(tmp_path, monkeypatch, text):
     for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE"):
         monkeypatch.delenv(name, raising=False)
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
+    path = rig_file(tmp_path, text)
     options, connection, plain = kept(path)
     path.unlink()
     monkeypatch.setenv("CAN_CHANNEL", "can9")              # what the environment says by then doesn't count
@@ -48,15 +48,13 @@ def test_the_way_to_a_drive_comes_back_without_its_files(tmp_path, monkeypatch, 
 def test_a_profile_comes_back_as_it_was(tmp_path, name):
     profile = load_profile(name)
     way = {"canopen": CANOPEN, "modbus": WAYS[1], "ethercat": WAYS[-1]}[profile.bus]
-    (tmp_path / "rig.yaml").write_text(f"profile: {name}\n{way}")
-    assert connection_of_kept(kept(tmp_path / "rig.yaml")[2])[1].profile == profile
+    assert connection_of_kept(kept(rig_file(tmp_path, f"profile: {name}\n{way}"))[2])[1].profile == profile
 
 
 def test_a_profile_of_the_user_s_is_kept_as_it_was(tmp_path):
     own = tmp_path / "own.yaml"
     own.write_text(profile_path("generic/modbus").read_text())
-    (tmp_path / "rig.yaml").write_text(f"profile: own.yaml\n{WAYS[1]}")
-    options, connection, plain = kept(tmp_path / "rig.yaml")
+    options, connection, plain = kept(rig_file(tmp_path, f"profile: own.yaml\n{WAYS[1]}"))
     own.write_text(own.read_text().replace("per_lsb: 0.1", "per_lsb: 0.2"))
     assert connection_of_kept(plain)[1].profile == connection.profile
     own.unlink()

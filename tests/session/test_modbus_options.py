@@ -11,9 +11,10 @@ from drivers.errors import DataFileError
 from profiles.library import load_modbus_profile
 from tdhil.buses.modbus import modbus_line
 from tdhil.config.resolution import resolve
-from tdhil.config.rig import Rig, load_rig
+from tdhil.config.rig import Rig
 from tdhil.errors import UsageError
 from tdhil.session.connection import connection_of
+from tests.rigs import loaded_rig
 
 PROFILE = load_modbus_profile("generic/modbus")
 
@@ -25,12 +26,6 @@ def no_bus_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(can.util, "CONFIG_FILES", [])
-
-
-def rig_of(tmp_path: Path, text: str) -> Rig:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    return load_rig(path)
 
 
 def chosen(cli: dict[str, Any], rig: Rig | None = None) -> tuple[str, str, str, str]:
@@ -48,7 +43,7 @@ def test_nobody_says_where() -> None:
 
 
 def test_each_value_comes_from_the_first_place_that_names_it(tmp_path: Path) -> None:
-    rig = rig_of(tmp_path, "modbus:\n  host: 192.0.2.10\n  port: 5020\n  unit: 7\n")
+    rig = loaded_rig(tmp_path, "modbus:\n  host: 192.0.2.10\n  port: 5020\n  unit: 7\n")
     found = modbus_line({"unit": 9}, rig, PROFILE)
     assert list(found.rows()) == [
         ("host", "192.0.2.10", "rig.yaml:2"), ("port", "5020", "rig.yaml:3"), ("unit", "9", "--unit"),
@@ -57,7 +52,7 @@ def test_each_value_comes_from_the_first_place_that_names_it(tmp_path: Path) -> 
 
 
 def test_the_command_line_s_serial_device_undoes_the_rig_s_host(tmp_path: Path) -> None:
-    rig = rig_of(tmp_path, "modbus: {host: 192.0.2.10, port: 5020}\n")
+    rig = loaded_rig(tmp_path, "modbus: {host: 192.0.2.10, port: 5020}\n")
     found = modbus_line({"serial": "/dev/ttyUSB0", "baud": 9600}, rig, PROFILE)
     assert list(found.rows()) == [
         ("serial", "/dev/ttyUSB0", "--serial"), ("baud", "9600", "--baud"),
@@ -91,9 +86,9 @@ def test_which_bus_is_meant(tmp_path: Path) -> None:
     assert chosen({"profile": "generic/modbus"})[:2] == ("modbus", "profile generic/modbus")
     assert chosen({"profile": "generic/cia402"})[:2] == ("canopen", "profile generic/cia402")
     assert chosen({"host": "a"})[:3] == ("modbus", "--host", "generic/modbus")
-    rig = rig_of(tmp_path, "modbus: {serial: /dev/ttyUSB0}\n")
+    rig = loaded_rig(tmp_path, "modbus: {serial: /dev/ttyUSB0}\n")
     assert chosen({}, rig)[:2] == ("modbus", "rig.yaml:1")
-    both = rig_of(tmp_path, "bus: {interface: virtual}\nmodbus: {serial: /dev/ttyUSB0}\n")
+    both = loaded_rig(tmp_path, "bus: {interface: virtual}\nmodbus: {serial: /dev/ttyUSB0}\n")
     assert chosen({}, both)[0] == "canopen"
     assert chosen({"drive": "modbus"}, both)[0] == "modbus"
 

@@ -8,6 +8,7 @@ from profiles import DataFileError
 from sim_bus.params import load_rig
 from sim_bus.plant import Harmonic, Params, build
 from sim_bus.plant.angle_torque import torque_over_step
+from tests.rigs import plant_file
 
 LIGHT = {"inertia_kg_m2": 2.0, "viscous_nm_s_rad": 0.0, "coulomb_nm": 0.0}
 
@@ -34,9 +35,8 @@ def test_a_plant_without_harmonics_is_the_same_plant():
 
 
 def test_plant_yaml_declares_harmonics(tmp_path):
-    path = tmp_path / "plant.yaml"
-    path.write_text("plant:\n  harmonics:\n    - {order: 6, amplitude_nm: 12.0, phase_rad: 0.5}\n")
+    path = plant_file(tmp_path, "plant:\n  harmonics:\n    - {order: 6, amplitude_nm: 12.0, phase_rad: 0.5}\n")
     assert load_rig(path).plant.harmonics == (Harmonic(order=6, amplitude_nm=12.0, phase_rad=0.5),)
-    path.write_text("plant:\n  harmonics:\n    - {order: 0, amplitude_nm: 12.0}\n")
+    plant_file(tmp_path, "plant:\n  harmonics:\n    - {order: 0, amplitude_nm: 12.0}\n")
     with pytest.raises(DataFileError, match="order"):
         load_rig(path)

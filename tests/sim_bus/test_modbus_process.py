@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_bus.modbus.lines import NotModbus, ReceivedRequest, RtuReceiver, crc, rtu_reply, tcp_reply, tcp_requests
+from tests.rigs import plant_file
 
 HOME = Path(__file__).parents[2]
 READ = struct.pack(">BHH", 3, 42, 2)
@@ -94,8 +95,7 @@ def test_over_a_pseudo_terminal() -> None:
 
 
 def test_what_cannot_be_used_costs_one_line(tmp_path: Path) -> None:
-    plant = tmp_path / "plant.yaml"
-    plant.write_text("plant:\n  inertja: 1\n")
+    plant = plant_file(tmp_path, "plant:\n  inertja: 1\n")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         cases = {

@@ -16,6 +16,7 @@ import pytest
 
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.canopen.socketcand import Hub, HubPort, WireFrame, frame_word, parse_send, split
+from tests.rigs import plant_file
 
 HANGS_S = 120.0
 
@@ -157,8 +158,7 @@ def refused(*arguments: str) -> str:
 
 @pytest.mark.heavy
 def test_bad_plant_file_and_used_port(tmp_path: Path) -> None:
-    plant = tmp_path / "plant.yaml"
-    plant.write_text("plant:\n  inertia_kg_m2: 50.0\n  inertja: 1\n")
+    plant = plant_file(tmp_path, "plant:\n  inertia_kg_m2: 50.0\n  inertja: 1\n")
     message = refused("--hub", "127.0.0.1:0", "--plant", str(plant))
     assert "inertja" in message and ":3:" in message
     with socket.create_server(("127.0.0.1", 0)) as taken:

@@ -18,11 +18,7 @@ from tests.path.path_runs import tdhil
 from tests.vcan.candump_log import HOSTS, SYNC, TPDO1, enables, watching
 from tests.vcan.vcan_runs import assert_safe, run, run_into, simulated
 
-
-@pytest.fixture(autouse=True)
-def no_bus_of_the_user(monkeypatch, tmp_path):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("no_bus_of_the_user")
 
 
 def assert_told(done, by_itself, *codes) -> None:

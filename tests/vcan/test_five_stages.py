@@ -52,12 +52,8 @@ def assert_log_is_what_was_on_the_bus(log: Path, seen: list) -> None:
     assert stamps == sorted(stamps)
 
 
+@pytest.mark.usefixtures("no_bus_of_the_user")
 class TestFiveStages(FiveStages):
-    @pytest.fixture(autouse=True)
-    def _no_bus_of_the_user(self, monkeypatch, tmp_path):
-        monkeypatch.setenv("HOME", str(tmp_path))
-        monkeypatch.chdir(tmp_path)
-
     @pytest.fixture
     def bus(self, vcan, tool):
         def watched(folder, *arguments):

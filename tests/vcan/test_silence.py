@@ -15,23 +15,14 @@ import pytest
 
 from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wait_for
+from tests.rigs import PATIENT, rig_file
 from tests.vcan.candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
 from tests.vcan.vcan_runs import TURNING_RAD_S, assert_safe, simulated
 
-RATE_HZ, WATCHDOG_S = 4.0, 5.0
-RIG = f"""\
-rate_hz: {RATE_HZ}
-limits: {{speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,
-  quick_stop_rad_s2: {QUICK_STOP_RAD_S2}, watchdog_s: {WATCHDOG_S}, probe_torque_nm: 200.0, probe_travel_rad: 3.0}}
-"""
+pytestmark = pytest.mark.usefixtures("no_bus_of_the_user")
+RATE_HZ = 4.0
 STAMP_S = 1.0 / RATE_HZ
 """How far the log's time of a sent frame may lie from the kernel's stamp of it, all but one in twenty: one cycle."""
-
-
-@pytest.fixture(autouse=True)
-def no_bus_of_the_user(monkeypatch, tmp_path):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
 
 
 def lost(drive):
@@ -39,8 +30,7 @@ def lost(drive):
 
 
 def test_a_frozen_host_is_silent_and_wakes_with_nothing_stale(tmp_path, vcan, tool):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(RIG)
+    rig = rig_file(tmp_path, f"rate_hz: {RATE_HZ}\n", PATIENT)
     on = ("-i", "socketcan", "-c", vcan)
     with watching(tool("candump"), tmp_path / "candump.log", vcan) as candump:
         with simulated(tmp_path, vcan, stepped=False) as drive, host(tmp_path, *on, "--rig", rig) as running:
