@@ -62,7 +62,7 @@ from tdhil.service.run_channel import ask, lives  # noqa: E402
 from tdhil.service.run_state import ENDED  # noqa: E402
 from tdhil.service.store import Store  # noqa: E402
 from tests.service.conftest import wait_for  # noqa: E402
-from tests.service.test_lost_run import LIMITS, simulated_drive, speed_rad_s  # noqa: E402
+from tests.service.test_lost_run import attended_rig, simulated_drive, speed_rad_s  # noqa: E402
 from tests.service.test_serve import Server, served  # noqa: E402
 
 RIG = "simulated-canopen"
@@ -377,9 +377,8 @@ def lost(folder: Path, times: int, seed: int) -> bool:
     rigs.mkdir()
     for number in range(times):
         trace = folder / f"shaft-{number}.csv"
-        with simulated_drive(trace) as port, contextlib.ExitStack() as stack:
-            (rigs / "real.yaml").write_text(
-                f"rate_hz: 10\nmodbus: {{host: 127.0.0.1, port: {port}}}\n{LIMITS}service: {{motion: attended}}\n")
+        with simulated_drive(trace) as drive, contextlib.ExitStack() as stack:
+            (rigs / "real.yaml").write_text(attended_rig(drive.port))
             server = stack.enter_context(served(folder / "data", "--rigs", str(rigs)))
             run = server.client.start("real")["id"]
             wait_for("motion", lambda server=server, run=run, trace=trace: ended_early(server, run)

@@ -37,8 +37,9 @@ def limits_text(**changes: object) -> str:
     return "".join(["limits:\n", *lines])
 
 
-PATIENT = limits_text(watchdog_s=5.0)
-"""For real time on a busy computer: a loop may pause for half of the watchdog's time."""
+PATIENT_S = 5.0
+"""Watchdog time for real time on a busy computer: a loop may pause for half of it."""
+PATIENT = limits_text(watchdog_s=PATIENT_S)
 
 
 def rig_file(folder: Path, *parts: str, name: str = "rig.yaml") -> Path:

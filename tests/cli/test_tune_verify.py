@@ -10,6 +10,7 @@ from tdhil.cli.main import main
 from tdhil.errors import ExitCode
 from tests.cli.test_tune import estimate
 from tests.cli.test_tune_speed import result
+from tests.rigs import plant_file
 
 
 @pytest.fixture
@@ -53,9 +54,9 @@ def test_a_file_that_tells_too_little_is_refused_before_motion(tuned, capsys, tm
 def test_a_run_finds_the_gain_that_was_typed_wrongly_and_its_replay_says_the_same(tuned, capsys, tmp_path):
     document, path = tuned
     gains = document["controllers"][-1]
-    plant, log, page = tmp_path / "plant.yaml", tmp_path / "v.mcap", tmp_path / "v.html"
-    plant.write_text(f"drive:\n  speed_gain_nm_s_rad: {0.7 * gains['gain_nm_s_rad']}\n"
-                     f"  speed_integral_gain_nm_rad: {gains['integral_nm_rad']}\n", encoding="utf-8")
+    log, page = tmp_path / "v.mcap", tmp_path / "v.html"
+    plant = plant_file(tmp_path, f"drive:\n  speed_gain_nm_s_rad: {0.7 * gains['gain_nm_s_rad']}\n",
+                       f"  speed_integral_gain_nm_rad: {gains['integral_nm_rad']}\n")
     code = main(["tune", "verify", str(path), "--simulate", "--plant", str(plant), "--seed", "5", "--log", str(log),
                  "--json"])
     live = json.loads(capsys.readouterr().out)

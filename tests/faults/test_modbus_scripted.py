@@ -4,11 +4,6 @@ What each row must look like is `test_modbus_rows`' concern, with faults made by
 the command line.
 """
 
-import contextlib
-import json
-import re
-import subprocess
-import sys
 from functools import partial
 
 import pytest
@@ -16,12 +11,9 @@ import pytest
 from sim_bus.modbus.faults import KINDS, ONLY_ON
 from tests.faults import rehearsal
 from tests.faults.rehearsal import IN_MOTION
-from tests.path.path_runs import HANGS_S, Shaft, ShaftTrace, process, tdhil, wait_for
+from tests.path.path_runs import host, modbus_peer, tdhil, wait_for
+from tests.rigs import PATIENT, limits_text, rig_file
 
-PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault
-    "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
-    " watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
-)
 NOTICED_S = 0.6                # half the watchdog's time, or all of it, and five cycles
 
 
@@ -57,8 +49,7 @@ CASES = (
 @pytest.mark.long
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
 def test_row(case, rehearse, tmp_path):
-    rig = tmp_path / "warm.yaml"
-    rig.write_text(PATIENT.replace("watchdog_s: 5.0", "watchdog_s: 0.5, temperature_c: 110.0"))
+    rig = rig_file(tmp_path, limits_text(temperature_c=110.0))
     run = rehearse("--drive", "modbus", "--fault", case.fault, "--rig", rig)
     run.assert_as(case)
     assert f"scripted fault {case.fault}" in " ".join(run.done.err.split())
@@ -99,31 +90,19 @@ def test_the_list_of_one_bus_is_shorter():
 @pytest.mark.real_time
 def test_a_connection_that_is_reset_in_motion(tmp_path):
     """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
-    trace, rig = tmp_path / "shaft.csv", tmp_path / "rig.yaml"
-    rig.write_text(PATIENT)
-    with contextlib.ExitStack() as stack:
-        drive = stack.enter_context(process(
-            sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--trace", trace,
-            "--fault", "reset@speed+2s", stdout=subprocess.PIPE,
-        ))
-        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
-        host = stack.enter_context(process(
-            sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", 4, "--rig", rig, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, cwd=tmp_path,
-        ))
-        out, err = host.communicate(timeout=HANGS_S)
-
-        follower = ShaftTrace(trace)
+    rig = rig_file(tmp_path, PATIENT)
+    with (modbus_peer(tmp_path / "shaft.csv", "--fault", "reset@speed+2s") as drive,
+          host(tmp_path, *drive.options, "--rate", 4, "--rig", rig, cwd=tmp_path) as running):
+        done = running.finish()
 
         def resting():
-            shaft = follower.read()
+            shaft = drive.shaft
             return shaft.time_s[-1] > shaft.at_rest_from() + 1.0
 
         wait_for("the shaft to come to rest", resting)
-        shaft = Shaft.read(trace)
-    assert host.returncode == 8, err           # it can't see the shaft come to rest
-    assert "connection" in json.loads(out)["error"]["message"] and "Traceback" not in err
+        shaft = drive.shaft
+    assert done.code == 8, done.err           # it can't see the shaft come to rest
+    assert "connection" in done.document["error"]["message"] and "Traceback" not in done.err
     (at_s,) = shaft.events("fault: ")
     assert shaft.speed_at(at_s) > 0.1
     assert shaft.events("host silent")[0] > at_s and not shaft.events("host is back")

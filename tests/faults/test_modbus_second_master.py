@@ -1,10 +1,7 @@
 """Rows 66 on: other clients of a Modbus drive that read, command, or change its settings; judged on the shaft."""
 
 import math
-import re
 import struct
-import subprocess
-import sys
 
 import pytest
 
@@ -13,14 +10,10 @@ from sim_bus.modbus import embedded
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 from tests.faults.rehearsal import at, run
-from tests.path.path_runs import REAL, Shaft, identify, process
+from tests.path.path_runs import REAL, Shaft, identify, modbus_peer
+from tests.rigs import limits_text, rig_file
 
 BY_NAME = "--accept-shared-watchdog"
-RIG = (
-    "name: bench 3\n"
-    "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
-    " watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
-)
 TURNING_RAD_S = 0.3
 
 
@@ -62,14 +55,10 @@ def test_a_host_dies_while_another_client_reads(tmp_path, what, runs_on):
 @pytest.mark.heavy
 def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen):
     """A real drive in a process of its own: nothing moves, and the way out is named."""
-    profile, trace, rig = fed_by(tmp_path, "any_request"), tmp_path / "shaft.csv", tmp_path / "rig.yaml"
-    rig.write_text(RIG)
-    with process(
-        sys.executable, *REAL, "modbus", "--tcp", "127.0.0.1:0", "--profile", profile, "--trace", trace,
-        stdout=subprocess.PIPE,
-    ) as drive:
-        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
-        line = ("--host", "127.0.0.1", "--port", port, "--profile", profile, "--rig", rig, "--rate", 4)
+    profile = fed_by(tmp_path, "any_request")
+    rig = rig_file(tmp_path, "name: bench 3\n", limits_text(watchdog_s=2.0))
+    with modbus_peer(tmp_path / "shaft.csv", "--profile", profile, program=REAL) as drive:
+        line = (*drive.options, "--profile", profile, "--rig", rig, "--rate", 4)
         refused = identify(tmp_path, *line, "--yes")
         taken = identify(tmp_path, *line, BY_NAME)         # and nobody at the terminal confirms
     assert refused.code == taken.code == 4
@@ -78,7 +67,7 @@ def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen)
     said = " ".join(taken.err.split())
     assert "may not detect a dead host" in said and "every other client of this drive is switched off" in said
     assert "no operator can confirm" in taken.document["error"]["message"]
-    shaft = Shaft.read(trace)
+    shaft = drive.shaft
     assert abs(shaft.speed_rad_s).max() < TURNING_RAD_S and "operation enabled" not in set(shaft.state)
     seen(66, message, None, "whole", 4)
 

@@ -5,33 +5,24 @@ Nothing is measured in wall time: the shaft's trace is in the plant's own.
 """
 
 import contextlib
-import json
-import re
 import select
+import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 
 import pytest
 
-from tests.path.path_runs import HANGS_S, SETTLING_S, ShaftTrace, process, tail_time, wait_for
+from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, modbus_peer, tail_time, wait_for
+from tests.rigs import PATIENT, PATIENT_S, rig_file
 
 pytestmark = pytest.mark.real_time
 
-WATCHDOG_S = 5.0
-"""Long, since in real time a busy machine must not be taken for a fault."""
-RIG = (
-    "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
-    f" watchdog_s: {WATCHDOG_S}, probe_torque_nm: 200.0, probe_travel_rad: 3.0}}\n"
-)
 TURNING_RAD_S = 1.0         # the sign probe stays below it, and ends at rest by itself
-QUICK_STOP_RAD_S2 = 2.0
 LATE_S = 0.3
 """A machine that is busy with other tests looks at its watchdog late."""
 RATE_HZ = 4.0
-"""Slow for the same reason: three cycles without feedback end a run."""
+"""Slow: in real time a busy machine must not be taken for a fault. Three cycles without feedback end a run."""
 
 
 class Relay(threading.Thread):
@@ -84,34 +75,26 @@ class Bench:
     """A simulated drive, and the command line that drives it."""
 
     def __init__(self, folder, stack):
-        self.folder, self.trace, self.log = folder, folder / "shaft.csv", folder / "run.mcap"
-        self.follower = ShaftTrace(self.trace)
-        self.stack = stack
-        drive = stack.enter_context(process(
-            sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--trace", self.trace,
-            stdout=subprocess.PIPE,
-        ))
-        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
-        self.port = int(port)
+        self.folder, self.trace, self.stack = folder, folder / "shaft.csv", stack
+        self.drive = stack.enter_context(modbus_peer(self.trace))
+        self.port = int(self.drive.port)
 
     def start(self, port):
-        (self.folder / "rig.yaml").write_text(RIG)
-        self.host = self.stack.enter_context(process(
-            sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", RATE_HZ, "--rig", self.folder / "rig.yaml", "--log", self.log,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=self.folder,
+        self.host = self.stack.enter_context(host(
+            self.folder, "--host", "127.0.0.1", "--port", port, "--rate", RATE_HZ,
+            "--rig", rig_file(self.folder, PATIENT), cwd=self.folder,
         ))
 
     @property
     def shaft(self):
-        return self.follower.read()
+        return self.drive.shaft
 
     def wait_until_turning(self):
         def turning():
             shaft = self.shaft
             return len(shaft.time_s) > 0 and shaft.speed_rad_s[-1] > TURNING_RAD_S
 
-        assert wait_for("the shaft to turn", turning, self.host), self.host.communicate()
+        assert wait_for("the shaft to turn", turning, self.host.child), self.host.err
         return float(self.shaft.time_s[-1])
 
     def silent_from(self):
@@ -134,7 +117,7 @@ class Bench:
         shaft = self.shaft
         ramp_s = shaft.speed_rad_s.max() / QUICK_STOP_RAD_S2
         standstill_s = shaft.at_rest_from() - since_s
-        assert standstill_s < WATCHDOG_S + LATE_S + ramp_s + SETTLING_S
+        assert standstill_s < PATIENT_S + LATE_S + ramp_s + SETTLING_S
         shaft.assert_never_let_go()
         return round(standstill_s, 2)
 
@@ -149,8 +132,8 @@ def bench(tmp_path):
 def test_a_killed_host(bench, seen):
     bench.start(bench.port)
     bench.wait_until_turning()
-    bench.host.kill()
-    bench.host.wait()
+    bench.host.signal(signal.SIGKILL)
+    bench.host.finish()
     standstill_s = bench.wait_at_rest(bench.silent_from())
     assert bench.shaft.events("host silent")
     seen(4, "SIGKILL over Modbus TCP: the drive's time-out stops the shaft", standstill_s)
@@ -166,15 +149,15 @@ def test_a_connection_that_dies(bench, fault, seen):
         bench.wait_until_turning()
         relay.fault = fault
         at_s = bench.silent_from()
-        out, err = bench.host.communicate(timeout=HANGS_S)
+        done = bench.host.finish()
         connections = relay.connections
     standstill_s = bench.wait_at_rest(at_s)
-    assert bench.host.returncode == 8, err
+    assert done.code == 8, done.err
     assert connections == 1, "connected anew while the drive was enabled"
-    error = json.loads(out)["error"]
+    error = done.document["error"]
     assert error["kind"] in ("LinkLost", "CommunicationLost", "NoReply")
     assert "127.0.0.1" in error["message"] or "no feedback" in error["message"]
-    assert "Traceback" not in err
+    assert "Traceback" not in done.err
     assert bench.shaft.events("host silent")
     seen(43, f"{fault}: {error['message']}", standstill_s, code=8)
 
@@ -185,14 +168,14 @@ def test_a_foreign_transaction_id_costs_a_sample_and_the_connection(bench, seen)
         bench.start(relay.port)
         bench.wait_until_turning()
         relay.fault = "foreign"
-        wait_for("a new connection", lambda: relay.connections == 2, bench.host)
+        wait_for("a new connection", lambda: relay.connections == 2, bench.host.child)
         at_s = float(bench.shaft.time_s[-1])
-        wait_for("the run to go on", lambda: bench.shaft.time_s[-1] > at_s + 1.0, bench.host)
-        assert bench.host.poll() is None
-        bench.host.terminate()
-        out, err = bench.host.communicate(timeout=HANGS_S)
+        wait_for("the run to go on", lambda: bench.shaft.time_s[-1] > at_s + 1.0, bench.host.child)
+        assert bench.host.child.poll() is None
+        bench.host.signal(signal.SIGTERM)
+        done = bench.host.finish()
         assert relay.connections == 2
-    assert bench.host.returncode == 143, err
-    assert "at standstill" in json.loads(out)["stop"]
+    assert done.code == 143, done.err
+    assert "at standstill" in done.document["stop"]
     bench.shaft.assert_never_let_go()
     seen(41, "the reply is dropped, the connection renewed, the run goes on", None, code=143)

@@ -16,6 +16,7 @@ from tdhil.runner import stage_planner
 from tdhil.runner.control_loop import ControlLoop
 from tests.faults.rehearsal import at
 from tests.path.path_runs import tdhil
+from tests.rigs import limits_text, rig_file
 
 NOTICED_AT_ONCE_S = 0.1
 SPEEDS = ("speed", 15.0)
@@ -134,13 +135,8 @@ def test_row_28_a_malformed_profile(name, text, no_bus_of_the_user, tmp_path, se
 @pytest.mark.heavy
 @pytest.mark.parametrize("which", ["time", "travel"])
 def test_row_35_time_and_travel(which, rehearse, tmp_path, seen):
-    rig = tmp_path / "rig.yaml"
-    short = {"time": ("20.0", "3.0"), "travel": ("900.0", "0.02")}[which]
-    rig.write_text(
-        f"limits: {{speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: {short[0]},"
-        f" quick_stop_rad_s2: 2.0, watchdog_s: 0.5, probe_torque_nm: 200.0, probe_travel_rad: {short[1]}}}\n"
-    )
-    run = rehearse("--rig", rig)
+    short = {"time": {"time_s": 20.0}, "travel": {"probe_travel_rad": 0.02}}[which]
+    run = rehearse("--rig", rig_file(tmp_path, limits_text(**short)))
     begun_s = run.shaft.events("state: quick stop active")[0] - 0.04
     code, *words = {"time": (7, "longer than the limit of 20 s", "limits.time_s"),
                     "travel": (4, "without a clear direction", "sign probe")}[which]

@@ -7,19 +7,12 @@ import pytest
 
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import tdhil
+from tests.rigs import STRING, limits_text, rig_file
 
 NOT_ARMED = ("--fault", "watchdog-not-armed")
 BY_NAME = "--accept-no-watchdog"
 BUSES = ("canopen", "modbus")
 WATCHED = {"canopen": "1016h:1", "modbus": "time_out"}
-RIG = """
-load: string
-make_up_torque_nm: 29000
-torque_ramp_nm_s: 400
-name: bench 3
-limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
-         watchdog_s: 0.5, probe_torque_nm: 200.0, probe_travel_rad: 3.0}
-"""
 
 
 @pytest.fixture(params=BUSES)
@@ -89,9 +82,7 @@ def test_set_otherwise_is_refused_by_name_too(rehearse, bus):
 
 
 def test_never_with_a_string(unarmed, tmp_path):
-    rig = tmp_path / "string.yaml"
-    rig.write_text(RIG)
-    run = unarmed(BY_NAME, "--rig", rig)
+    run = unarmed(BY_NAME, "--rig", rig_file(tmp_path, "name: bench 3\n", STRING, limits_text()))
     run.assert_ended(4, "drill string", "no watchdog", BY_NAME, "load in rig.yaml")
     run.assert_nothing_moved()
     run.assert_log_whole()

@@ -8,21 +8,12 @@ import pytest
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import Pump
 from tests.faults.rehearsal import at
-
-RIG = """
-load: string
-make_up_torque_nm: 29000
-torque_ramp_nm_s: 400
-limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
-         watchdog_s: 0.5, probe_torque_nm: 200.0, probe_travel_rad: 3.0}
-"""
+from tests.rigs import STRING, limits_text, rig_file
 
 
 @pytest.mark.parametrize(("drive", "profile"), [("canopen", "siemens/s120-canopen"), ("modbus", "siemens/g130-s120")])
 def test_a_string_and_a_quick_stop_that_lets_go(drive, profile, rehearse, tmp_path, seen):
-    rig = tmp_path / "string.yaml"
-    rig.write_text(RIG, encoding="utf-8")
-    run = rehearse("--drive", drive, "--profile", profile, "--rig", rig)
+    run = rehearse("--drive", drive, "--profile", profile, "--rig", rig_file(tmp_path, STRING, limits_text()))
     run.assert_ended(4, "drill string", "is disabled after a quick stop", "quick_stop of the profile")
     run.assert_nothing_moved()
     seen(79, f"`load: string` with {profile}: {run.message}", None, run.assert_log_whole(), run.done.code)

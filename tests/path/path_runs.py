@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from tdhil.cli.main import main
+from tests.rigs import NUMBERS
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 QUICK = ("--rate", 50)    # a fifth of the drive's usual rate, and of the cycles to compute
@@ -37,9 +38,7 @@ HANGS_S = 600.0           # wall time after which something is taken to hang, on
 HELD = {"operation enabled", "quick stop active"}   # the states in which the drive holds its shaft
 
 # What the simulated rig is run with where nothing else is said (tdhil.config.rig, sim_bus.params).
-WATCHDOG_S = 0.5
-QUICK_STOP_RAD_S2 = 2.0
-TORQUE_NM = 400.0
+WATCHDOG_S, QUICK_STOP_RAD_S2, TORQUE_NM = (NUMBERS[key] for key in ("watchdog_s", "quick_stop_rad_s2", "torque_nm"))
 INERTIA, SPEED_GAIN = 104.0, 300.0
 SETTLING_S = 5.0 * INERTIA / SPEED_GAIN
 """How long the drive's own speed loop trails behind the end of its ramp: five times J/K_p."""
@@ -243,6 +242,11 @@ class Peer:
         """What the shaft has done so far."""
         return self._follower.read()
 
+    @property
+    def port(self) -> str:
+        """Of a Modbus drive."""
+        return self.options[-1]
+
 
 @contextlib.contextmanager
 def peer(folder: Path, *arguments: object, program: tuple[object, ...] = PATIENT) -> Iterator[Peer]:
@@ -265,6 +269,17 @@ def peer(folder: Path, *arguments: object, program: tuple[object, ...] = PATIENT
         else:
             options = tuple(str(argument) for argument in arguments[:4])     # -i … -c …
         yield Peer(options, trace, child)
+
+
+@contextlib.contextmanager
+def modbus_peer(trace: Path, *arguments: object, program: tuple[object, ...] = PLAIN) -> Iterator[Peer]:
+    """A simulated Modbus drive on a free TCP port."""
+    with process(sys.executable, *program, "modbus", "--tcp", "127.0.0.1:0", "--trace", trace, *arguments,
+                 stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        found = re.search(r"127\.0\.0\.1:(\d+)", child.stdout.readline())
+        assert found
+        yield Peer(("--host", "127.0.0.1", "--port", found.group(1)), trace, child)
 
 
 @dataclass

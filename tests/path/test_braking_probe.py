@@ -13,6 +13,7 @@ from sim_bus.application_objects import ApplicationObjects
 from sim_bus.inverter import Controller
 from sim_bus.modbus.registers import Map
 from tests.path.path_runs import Shaft, identify
+from tests.rigs import rig_file
 
 PROFILES = {name: load_profile(name) for name in profile_names()}
 VENDORS = [name for name, one in PROFILES.items() if isinstance(one, ModbusProfile) and one.modes.torque]
@@ -83,7 +84,5 @@ def test_over_canopen(regulates_torque, monkeypatch, tmp_path):
         plain(self, counts % 0x10000)
 
     monkeypatch.setattr(ApplicationObjects, "_set_target_torque", unsigned)
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("rate_hz: 50\n")
-    done, shaft = run(tmp_path, "--rig", rig)
+    done, shaft = run(tmp_path, "--rig", rig_file(tmp_path, "rate_hz: 50\n"))
     assert_found(done, shaft, "6071h")

@@ -12,6 +12,7 @@ from sim_bus.params import RigParams
 from tdhil.recording import RunLog, RunWriter
 from tdhil.recording.log_reader import read_run, read_samples
 from tests.path.path_runs import QUICK, SHORT, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
+from tests.rigs import plant_file, rig_file
 
 KEYS = {
     "verdict", "model", "inertia_kg_m2", "inertia_main_shaft_kg_m2", "reference_inertia_kg_m2", "viscous_nm_s_rad",
@@ -22,8 +23,7 @@ ESTIMATE = {"value", "low", "high"}
 
 @pytest.mark.heavy
 def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("gear: {ratio: 2.0}\nreference_inertia_kg_m2: 104.0\nrate_hz: 50\n"
+    rig = rig_file(tmp_path, "gear: {ratio: 2.0}\nreference_inertia_kg_m2: 104.0\nrate_hz: 50\n",
                    "run: {json: true, seed: 1, periods: 3}\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
@@ -122,8 +122,8 @@ def test_a_wrong_command_line_ends_with_2_and_names_what_is_wrong(tmp_path, argu
 
 
 def test_a_bad_rig_shows_every_problem_with_its_line(tmp_path):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(
+    rig = rig_file(
+        tmp_path,
         "node: 1\n"
         "node: 2\n"
         "rate_hz: 1e3\n"
@@ -302,8 +302,7 @@ def test_speed_mode_skips_what_belongs_to_torque_mode(tmp_path):
 
 @pytest.mark.heavy
 def test_another_plant_is_another_result(tmp_path):
-    plant = tmp_path / "plant.yaml"
-    plant.write_text("plant: {inertia_kg_m2: 60.0}\n")
+    plant = plant_file(tmp_path, "plant: {inertia_kg_m2: 60.0}\n")
     done = identify(tmp_path, *SHORT, "--plant", plant)
     assert done.code == 0, done.err
     assert done.document["inertia_kg_m2"]["value"] == pytest.approx(60.0, rel=0.03)

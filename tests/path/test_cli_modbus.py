@@ -1,8 +1,6 @@
 """`tdhil identify --drive modbus`: the whole path on the embedded simulator, and everything that can be mistyped."""
 
 import os
-import re
-import subprocess
 import sys
 import termios
 from types import SimpleNamespace
@@ -11,25 +9,14 @@ import pytest
 
 from profiles.library import load_modbus_profile, load_profile, profile_path
 from tdhil.recording.log_reader import read_frames, read_run
-from tests.path.path_runs import QUICK, TOO_MUCH, identify, process, tdhil
+from tests.path.path_runs import QUICK, TOO_MUCH, identify, modbus_peer, tdhil
+from tests.rigs import limits_text, rig_file
 
 pytestmark = pytest.mark.one_worker
 
 WRITING = {5, 6, 15, 16, 22, 23}
 """Function codes that write (Modbus Application Protocol V1.1b3, section 6)."""
-RIG = """\
-name: bench 3
-modbus: {unit: 1}
-limits:
-  speed_min_rad_s: 0.5
-  speed_max_rad_s: 10.0
-  torque_nm: 400.0
-  time_s: 900.0
-  quick_stop_rad_s2: 2.0
-  watchdog_s: 2.0
-  probe_torque_nm: 200.0
-  probe_travel_rad: 3.0
-"""
+RIG = "modbus: {unit: 1}\n" + limits_text(watchdog_s=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -154,18 +141,15 @@ def test_a_serial_device_that_refuses_its_settings(monkeypatch, command):
 
 
 @pytest.mark.heavy
-def test_a_drive_in_another_process_over_tcp():
-    with process(sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--unit", 3,
-                 stdout=subprocess.PIPE) as drive:
-        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
-        options = ("--host", "127.0.0.1", "--port", port)
-        scanned = tdhil("scan", *options, "--units", "2-3", "--json")
-        looked = tdhil("doctor", *options, "--unit", 3)
-        nobody = tdhil("scan", *options, "--units", "9")
-        profile = tdhil("doctor", *options, "--unit", 3, "--profile", "siemens/g130-s120")
+def test_a_drive_in_another_process_over_tcp(tmp_path):
+    with modbus_peer(tmp_path / "shaft.csv", "--unit", 3) as drive:
+        scanned = tdhil("scan", *drive.options, "--units", "2-3", "--json")
+        looked = tdhil("doctor", *drive.options, "--unit", 3)
+        nobody = tdhil("scan", *drive.options, "--units", "9")
+        profile = tdhil("doctor", *drive.options, "--unit", 3, "--profile", "siemens/g130-s120")
     (found,) = scanned.document["found"]
     assert (found["address"], found["simulated"], found["profile"]) == (3, True, "generic/modbus")
-    assert found["line"] == {"host": "127.0.0.1", "port": int(port)}
+    assert found["line"] == {"host": "127.0.0.1", "port": int(drive.port)}
     assert looked.code == 0, looked.out
     assert "305419896" in looked.out
     assert nobody.code == 5
@@ -191,8 +175,7 @@ def real(monkeypatch, tmp_path):
     path.write_text(head + "watchdog:\n" + tail.replace("\n  confidence: verified", "\n  confidence: unverified", 1),
                     encoding="utf-8")
     assert load_modbus_profile(str(path)).below("unverified") == ("watchdog",)
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(RIG)
+    rig = rig_file(tmp_path, "name: bench 3\n", RIG)
     return "--profile", path, "--rig", rig, "--simulate", "--real-time"
 
 
@@ -221,7 +204,7 @@ def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
 
 def test_without_a_name_nothing_real_is_moved(tmp_path, real):
     """A result without a rig belongs to no history; the simulated rig needs none."""
-    (tmp_path / "rig.yaml").write_text(RIG.replace("name: bench 3\n", ""))
+    rig_file(tmp_path, RIG)
     done = identify(tmp_path, *real, "--yes", "--accept-unverified", "likely", "--accept-unverified", "watchdog")
     assert (done.code, done.document["error"]["code"]) == (4, "TDH-440")
     assert "name: bench 3" in done.err and "nothing has moved" in done.err

@@ -7,6 +7,7 @@ T = J α + b on a single tone, then gives J (1 + ω² τ_w τ_T)/(1 + ω² τ_T�
 import pytest
 
 from tests.path.path_runs import identify
+from tests.rigs import plant_file
 
 INERTIA = 104.0
 RATE_HZ = 100
@@ -58,8 +59,7 @@ def test_the_default_excitation_finds_the_inertia(tmp_path, seed):
 ])
 def test_a_rig_whose_friction_bends_over_speed_is_identified(tmp_path, seed):
     """Stribeck's bell reaches well into the speed window: straight friction is contradicted, the inertia found."""
-    plant = tmp_path / "plant.yaml"
-    plant.write_text("plant: {friction: stribeck, static_nm: 100, stribeck_speed_rad_s: 3.0}\n", encoding="utf-8")
+    plant = plant_file(tmp_path, "plant: {friction: stribeck, static_nm: 100, stribeck_speed_rad_s: 3.0}\n")
     done = identify(tmp_path, "--simulate", "--seed", seed, "--plant", plant)
     assert done.code == 0, done.err
     document = done.document

@@ -10,13 +10,13 @@ from profiles import load_profile
 from tdhil.cli.dry_run import say_before
 from tdhil.cli.identify import show_settings
 from tdhil.config.resolution import resolve
-from tdhil.config.rig import load_rig
 from tdhil.runner.excitation import PlanRefused
 from tdhil.runner.planning import refuse_undersampled
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.session import connection_of, plan_peer
 from tdhil.session.dry_run import refuse_hopeless
 from tests.path.path_runs import tdhil
+from tests.rigs import STRING, limits_text, loaded_rig, rig_file
 from tests.runner.line_drive import Line, LineDrive, run_line
 
 QUICK = ("--seed", 1)
@@ -97,13 +97,9 @@ def test_what_may_be_done_is_not_refused(arguments):
 
 def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
     """An amplitude that the assumed shaft is too heavy for: a lighter one may turn out to hang there."""
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(
-        "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10, torque_nm: 400, time_s: 900, quick_stop_rad_s2: 2,"
-        " probe_torque_nm: 200, probe_travel_rad: 3}\nexpected: {inertia_kg_m2: 2000}\n"
-    )
-    options = resolve({"amplitude_rad_s": 1.0, "excitation": "sine", "frequency_hz": 0.5}, load_rig(rig))
-    refuse_hopeless(options, load_rig(rig), TORQUE)
+    rig = loaded_rig(tmp_path, limits_text(watchdog_s=None), "expected: {inertia_kg_m2: 2000}\n")
+    options = resolve({"amplitude_rad_s": 1.0, "excitation": "sine", "frequency_hz": 0.5}, rig)
+    refuse_hopeless(options, rig, TORQUE)
 
 
 @pytest.mark.parametrize(("profile", "lets_go"), [
@@ -111,12 +107,7 @@ def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
 ])
 def test_a_dry_run_knows_what_lets_go_of_a_string(tmp_path, profile, lets_go):
     """By the profile, as the run itself refuses it in preflight."""
-    rig = tmp_path / "string.yaml"
-    rig.write_text(
-        "load: string\nmake_up_torque_nm: 29000\ntorque_ramp_nm_s: 400\n"
-        "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10, torque_nm: 400, time_s: 900, quick_stop_rad_s2: 2,"
-        " probe_torque_nm: 200, probe_travel_rad: 3}\n"
-    )
+    rig = rig_file(tmp_path, STRING, limits_text(watchdog_s=None), name="string.yaml")
     done = tdhil("identify", "--dry-run", "--simulate", "--rig", rig, "--profile", profile,
                  "--excitation", "sine", "--frequency", 0.5)
     assert done.code == (4 if lets_go else 0), done.err

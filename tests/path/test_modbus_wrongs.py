@@ -19,6 +19,7 @@ from sim_bus.modbus.wrong_maps import parse
 from tdhil.recording.log_reader import read_frames
 from tdhil.session.overrides import accepted_lines, require_accepted
 from tests.path.path_runs import Shaft, identify
+from tests.rigs import DRIVE_LIMITS, limits_text, rig_file
 
 NAMES = [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]
 WRONGS = ("word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied")
@@ -116,7 +117,6 @@ def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_p
 @pytest.mark.parametrize("name", some_always((name,) for name in NAMES))
 def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     from drivers.clock import SteppedClock
-    from drivers.drive import DriveLimits
     from drivers.modbus.drive import ModbusDrive
     from drivers.modbus.link import EmbeddedLink
 
@@ -125,7 +125,7 @@ def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     drive = ModbusDrive(EmbeddedLink(peer.serve, SteppedClock()), profile, unit=peer.unit, given=dict(peer.untold),
                         rated_torque_nm=None if profile.rated_torque else peer.rated_torque_nm)
     drive.connect()
-    found = drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
+    found = drive.preflight(DRIVE_LIMITS)
     assert found.refused == ()
     notes = [check.name for check in found.checks if "in motion only" in check.found]
     assert notes == [f"{name} setpoint as received by the drive" for name in unseen(profile)]
@@ -159,10 +159,7 @@ def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, 
     profile, trace = load_modbus_profile(name), tmp_path / "shaft.csv"
     asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
     others = {"likely", *profile.below("unverified")} - asked
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("name: bench 3\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, "
-                   "time_s: 900.0, quick_stop_rad_s2: 2.0, probe_torque_nm: 150.0, probe_travel_rad: 3.0}\n",
-                   encoding="utf-8")
+    rig = rig_file(tmp_path, "name: bench 3\n", limits_text(probe_torque_nm=150.0, watchdog_s=None))
     done = identify(tmp_path, "--simulate", "--real-time", "--yes", "--profile", name, "--trace", trace, "--rig", rig,
                     *(f"--accept-unverified={one}" for one in others))
     assert done.code == 4, done.err

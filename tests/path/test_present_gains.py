@@ -7,6 +7,7 @@ import json
 import pytest
 
 from tests.path.path_runs import QUICK, identify, tdhil
+from tests.rigs import plant_file
 
 pytestmark = pytest.mark.heavy
 PLANT = "drive: {speed_gain_nm_s_rad: 250.0, speed_integral_gain_nm_rad: 125.0}\n"
@@ -18,9 +19,7 @@ PLANT = "drive: {speed_gain_nm_s_rad: 250.0, speed_integral_gain_nm_rad: 125.0}\
     (("--drive", "modbus", *QUICK), ["register 64", "register 66", "register 68"]),
 ])
 def test_they_are_shown_without_typing(tmp_path, words, where):
-    plant = tmp_path / "plant.yaml"
-    plant.write_text(PLANT, encoding="utf-8")
-    run = identify(tmp_path, "--simulate", *words, "--plant", plant, "--seed", 3, "--periods", 3)
+    run = identify(tmp_path, "--simulate", *words, "--plant", plant_file(tmp_path, PLANT), "--seed", 3, "--periods", 3)
     assert run.code == 0, run.err
     present = run.document["speed_loop_present"]
     assert (present["gain_nm_s_rad"], present["integral_nm_rad"]) == (pytest.approx(250.0), pytest.approx(125.0))

@@ -12,33 +12,17 @@ import time
 import pytest
 
 from tests.path.path_runs import HANGS_S, REAL, Terminal, host, identify, peer, tail_time, wait_for
+from tests.rigs import PATIENT, PATIENT_S, rig_file
 
 pytestmark = pytest.mark.real_time
 
-WATCHDOG_S = 5.0
 ACCEPTED = "accept_unverified: [likely]\n"
-RIG = f"""\
-rate_hz: 4
-{ACCEPTED}\
-limits:
-  speed_min_rad_s: 0.5
-  speed_max_rad_s: 10.0
-  torque_nm: 400.0
-  time_s: 900.0
-  quick_stop_rad_s2: 2.0
-  watchdog_s: {WATCHDOG_S}
-  probe_torque_nm: 200.0
-  probe_travel_rad: 3.0
-name: bench 3
-run: {{excitation: sine, frequency_hz: 0.2}}
-"""
+RIG = f"rate_hz: 4\n{ACCEPTED}{PATIENT}name: bench 3\nrun: {{excitation: sine, frequency_hz: 0.2}}\n"
 
 
 @pytest.fixture
 def rig(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text(RIG)
-    return path
+    return rig_file(tmp_path, RIG)
 
 
 @pytest.fixture
@@ -85,8 +69,7 @@ def test_without_a_rig_it_is_refused(tmp_path, drive):
 
 @pytest.mark.heavy
 def test_a_rig_without_limits_is_refused(tmp_path, drive):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("node: 1\n")
+    rig = rig_file(tmp_path, "node: 1\n")
     done = identify(tmp_path, *drive.options, "--rig", rig, "--yes")
     assert done.code == 4
     assert "no machine limits" in done.err
@@ -194,7 +177,7 @@ def test_the_word_moves_the_shaft_and_the_prompt_fed_the_watchdog(prompt, drive)
         assert asked in prompt.plain
     before_s = tail_time(drive.trace)
     end = time.monotonic() + HANGS_S
-    while tail_time(drive.trace) < before_s + 1.5 * WATCHDOG_S:
+    while tail_time(drive.trace) < before_s + 1.5 * PATIENT_S:
         assert time.monotonic() < end
         prompt.read_until("anything else")            # somebody thinks for longer than the watchdog would wait
         time.sleep(0.05)

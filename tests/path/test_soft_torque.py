@@ -20,6 +20,7 @@ from sim_bus.canopen.command import add_arguments
 from sim_bus.canopen.inline import InlineSimulator
 from sim_bus.command_arguments import rig_of
 from tdhil.soft_torque import Interval, TopDrive, TuneCase, load_string, tune
+from tests.rigs import plant_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RPM = 2.0 * pi / 60.0
@@ -44,8 +45,7 @@ def gains():
 def rig_with(tmp_path, law):
     """As `tdhil simulate canopen --plant … --gains P I` makes it: the example, on 3,000 m."""
     text = (EXAMPLES / "plant_stick_slip.yaml").read_text(encoding="utf-8")
-    plant = tmp_path / "plant.yaml"
-    plant.write_text(text.replace("kind: string\n", "kind: string\n  length_m: 3000.0\n", 1), encoding="utf-8")
+    plant = plant_file(tmp_path, text.replace("kind: string\n", "kind: string\n  length_m: 3000.0\n", 1))
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     return rig_of(parser.parse_args(

@@ -8,6 +8,7 @@ import can
 import pytest
 
 from tests.path.path_runs import HANGS_S, QUICK, host, peer, process, tdhil, wait_for
+from tests.rigs import PATIENT, rig_file
 
 pytestmark = pytest.mark.real_time
 
@@ -102,11 +103,7 @@ def test_a_quick_stop_that_would_coast_is_replaced_first(turning):
 @pytest.mark.heavy
 def test_while_a_run_of_ours_is_under_way(tmp_path):
     """Two masters, three processes: the run sees its drive taken from it, and ends by its own stop."""
-    rig = tmp_path / "rig.yaml"        # a slow cycle and a long watchdog bear a loaded machine
-    rig.write_text(
-        "rate_hz: 4\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
-        " quick_stop_rad_s2: 2.0, watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
-    )
+    rig = rig_file(tmp_path, "rate_hz: 4\n", PATIENT)
     with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
         assert running.wait_for_line("stage speed …"), running.err
         turns = wait_for("speed", lambda: max(drive.shaft.speed_rad_s, default=0.0) > 1.0, running.child)

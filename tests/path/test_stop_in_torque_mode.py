@@ -11,17 +11,12 @@ import yaml
 
 from profiles.library import profile_path
 from tests.path.path_runs import HELD, QUICK, Shaft, identify
+from tests.rigs import STRING, limits_text, plant_file, rig_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RAMP_NM_S, TORQUE_NM, SPEED_RAD_S = 100.0, 4000.0, 10.0
-RIG = f"""
-rate_hz: 50
-limits: {{speed_min_rad_s: 2.0, speed_max_rad_s: {SPEED_RAD_S}, torque_nm: {TORQUE_NM}, time_s: 900.0,
-         quick_stop_rad_s2: 2.0, watchdog_s: 0.5, probe_torque_nm: 2000.0, probe_travel_rad: 60.0}}
-load: string
-make_up_torque_nm: 29000
-torque_ramp_nm_s: {RAMP_NM_S}
-"""
+LIMITS = limits_text(speed_min_rad_s=2.0, speed_max_rad_s=SPEED_RAD_S, torque_nm=TORQUE_NM, probe_torque_nm=2000.0,
+                     probe_travel_rad=60.0)
 KEEPS_MODE = ("--fault", "mode-not-followed@hold")
 
 
@@ -61,11 +56,10 @@ def test_friction_stops_the_shaft_before_the_drive_is_disabled(tmp_path, generic
 @pytest.mark.parametrize("generic", BUSES)
 def test_the_torque_of_a_string_comes_down_on_the_ramp(tmp_path, generic):
     """The bit and the mud hold the string back, so that it is wound up while it turns."""
-    rig, plant = tmp_path / "rig.yaml", tmp_path / "plant.yaml"
-    rig.write_text(RIG, encoding="utf-8")
+    rig = rig_file(tmp_path, "rate_hz: 50\n", LIMITS, STRING.replace("400", f"{RAMP_NM_S}"))
     rough = yaml.safe_load((EXAMPLES / "plant_two_mass.yaml").read_text(encoding="utf-8"))
     rough["plant"]["bottom"] |= {"coulomb_nm": 800.0, "viscous_nm_s_rad": 60.0}
-    plant.write_text(yaml.safe_dump(rough), encoding="utf-8")
+    plant = plant_file(tmp_path, yaml.safe_dump(rough))
     shaft = stopped(tmp_path, generic, "--rig", rig, "--plant", plant, "--periods", 3)
     off = max(k for k, state in enumerate(shaft.state) if state in HELD)
     seconds = [k for k in range(off) if k == 0 or int(shaft.time_s[k]) > int(shaft.time_s[k - 1])]

@@ -5,17 +5,15 @@ from pathlib import Path
 import pytest
 
 from tests.path.path_runs import HELD, Shaft, identify
+from tests.rigs import STRING, limits_text, rig_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-RIG = """
-rate_hz: 100
-limits: {{speed_min_rad_s: 2.0, speed_max_rad_s: {speed}, torque_nm: {torque}, time_s: {time},
-         quick_stop_rad_s2: {ramp}, watchdog_s: 0.5, probe_torque_nm: {probe}, probe_travel_rad: 60.0}}
-load: string
-make_up_torque_nm: 29000
-torque_ramp_nm_s: 400
-run: {{mode: speed}}
-"""
+
+
+def string_rig(folder, speed, torque, probe, ramp, time):
+    limits = limits_text(speed_min_rad_s=2.0, speed_max_rad_s=speed, torque_nm=torque, time_s=time,
+                         quick_stop_rad_s2=ramp, probe_torque_nm=probe, probe_travel_rad=60.0)
+    return rig_file(folder, "rate_hz: 100\n", limits, STRING, "run: {mode: speed}\n")
 
 
 @pytest.mark.heavy
@@ -25,8 +23,7 @@ run: {{mode: speed}}
      ("plant_stick_slip.yaml", 22.0, 15000.0, 8000.0, 3.0, 25.0)],
 )
 def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, plant, speed, torque, probe, ramp, time):
-    rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"
-    rig.write_text(RIG.format(speed=speed, torque=torque, probe=probe, ramp=ramp, time=time))
+    rig, trace = string_rig(tmp_path, speed, torque, probe, ramp, time), tmp_path / "shaft.csv"
     done = identify(
         tmp_path, "--simulate", "--seed", 3, "--plant", EXAMPLES / plant, "--rig", rig, "--trace", trace
     )
@@ -59,7 +56,5 @@ def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
     assert suited(None, None) is None
     assert suited(None, RigParams()) is None
     assert suited(Rig(node=3), load_plant(EXAMPLES / "plant_two_mass.yaml")).node == 3
-    path = tmp_path / "rig.yaml"
-    path.write_text(RIG.format(speed=10, torque=400, probe=200, ramp=2, time=20))
-    rig = load_rig(path)
+    rig = load_rig(string_rig(tmp_path, 10, 400, 200, 2, 20))
     assert suited(rig, load_plant(EXAMPLES / "plant_string.yaml")) is rig

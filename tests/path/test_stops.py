@@ -33,6 +33,7 @@ from tests.path.path_runs import (
     tdhil,
     wait_for,
 )
+from tests.rigs import PATIENT, rig_file
 
 CYCLE_S = 0.02
 LONG = (*QUICK, "--periods", 40)      # no stage 5 ends before the signal is there
@@ -112,11 +113,7 @@ def assert_stopped(shaft, done):
 @pytest.mark.real_time
 def test_ctrl_c_in_real_time(tmp_path):
     """The embedded simulator against the wall clock; a slow cycle and a long watchdog bear a loaded machine."""
-    rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"
-    rig.write_text(
-        "rate_hz: 4\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
-        " quick_stop_rad_s2: 2.0, watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
-    )
+    rig, trace = rig_file(tmp_path, "rate_hz: 4\n", PATIENT), tmp_path / "shaft.csv"
     with host(tmp_path, "--simulate", "--real-time", "--seed", 1, "--trace", trace, "--rig", rig) as running:
         assert running.wait_for_line("stage speed …"), running.err
         running.signal(signal.SIGINT)

@@ -18,6 +18,7 @@ from tdhil.recording.log_reader import Ours, messages, read_run
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Stage
 from tests.path.path_runs import tdhil
+from tests.rigs import rig_file
 
 USER, HOST = "janedoe", "drilling-laptop-7"
 HOMES = "/ho" "me"      # written so that no path of a home stands in the tree
@@ -64,8 +65,7 @@ def texts(archive: Path, folder: Path) -> dict[str, str]:
 
 
 def test_the_archive_holds_all_that_is_needed_and_nobody_s_name(log, tmp_path):
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(f"# bench of Jane, {USER}@{HOST}\nnode: 3\n# password: hunter2\n")
+    rig = rig_file(tmp_path, f"# bench of Jane, {USER}@{HOST}\nnode: 3\n# password: hunter2\n")
     done = tdhil("support", log, "--rig", rig)
     assert done.code == 0, done.err
     found = texts(tmp_path / "run.support.zip", tmp_path / "out")

@@ -7,6 +7,7 @@ from tdhil.cli.arguments import amount, share
 from tdhil.recording import LogTail
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import QUICK, Shaft, identify, tdhil
+from tests.rigs import rig_file
 
 
 def half_width(document):
@@ -74,8 +75,7 @@ def test_periods_fix_the_length_and_the_tolerance_is_only_compared(tmp_path):
 @pytest.mark.heavy
 def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rig = tmp_path / "rig.yaml"
-    rig.write_text("expected: {inertia_kg_m2: 90.0, load_noise_nm: 4.0}\n")
+    rig = rig_file(tmp_path, "expected: {inertia_kg_m2: 90.0, load_noise_nm: 4.0}\n")
     done = tdhil("identify", "--dry-run", "--rig", rig, "--json")
     assert done.code == 0, done.err
     document = done.document

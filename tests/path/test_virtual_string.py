@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.path.path_runs import LETS_GO_S, Shaft, host, peer, tdhil, wait_for
+from tests.rigs import plant_file, rig_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLANT = (EXAMPLES / "plant_top_drive.yaml").read_text(encoding="utf-8")
@@ -55,8 +56,8 @@ def files(tmp_path):
     document["string"] |= {"impedance_nm_s_rad": string.impedance_nm_s_rad, "echo_s": string.echo_s,
                            "stiffness_nm_rad": string.stiffness_nm_rad}
     (tmp_path / "tune.json").write_text(json.dumps(document))
-    (tmp_path / "plant.yaml").write_text(PLANT)
-    (tmp_path / "rig.yaml").write_text(RIG)
+    plant_file(tmp_path, PLANT)
+    rig_file(tmp_path, RIG)
     return tmp_path
 
 
@@ -92,7 +93,7 @@ def test_the_drives_own_loop_does_what_tune_says_of_its_gains(files):
     """The string through 60B2h; the gains are the plant's."""
     text = PLANT.replace("_nm_s_rad: 6000.0", "_nm_s_rad: 1186").replace("_nm_rad: 4000.0", "_nm_rad: 1000")
     assert "gain_nm_s_rad: 1186\n" in text and "gain_nm_rad: 1000\n" in text
-    (files / "plant.yaml").write_text(text)
+    plant_file(files, text)
     done = evaluate(files, "--own-loop")
     document = done.document
     assert (done.code, document["verdict"]) == (0, "as_predicted"), done.err
@@ -181,10 +182,10 @@ def test_a_dry_run_names_what_keeps_the_string_from_being_turned(files, change, 
         document["controllers"][0]["at_main_shaft"]["gain_nm_s_rad"] = 459.0
         (files / "tune.json").write_text(json.dumps(document))
     elif key == "speed_min_rad_s":
-        (files / "rig.yaml").write_text(RIG.replace("speed_min_rad_s: 0.5", f"speed_min_rad_s: {value}"))
+        rig_file(files, RIG.replace("speed_min_rad_s: 0.5", f"speed_min_rad_s: {value}"))
     else:
         hangs = "load: {kind: string}\nmake_up_torque_nm: 20000\ntorque_ramp_nm_s: 100\n"
-        (files / "rig.yaml").write_text(RIG + hangs)
+        rig_file(files, RIG, hangs)
     done = evaluate(files, "--dry-run")
     assert done.code == 4 and said in " ".join(done.err.split()), done.err
 

@@ -30,6 +30,7 @@ from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.web import Web
 from tdhil.service.worker import WORK
+from tests.rigs import limits_text
 
 FAKE = Path(__file__).with_name("fake_run.py")
 URL = "http://127.0.0.1:8420"
@@ -128,9 +129,7 @@ def rigs(tmp_path: Path, nobody_s_port: int, own_locks: None) -> Path:
     folder.mkdir()
     for name in ("a", "b"):
         (folder / f"{name}.yaml").write_text(f"name: Rig {name}\nrun: {{simulate: true}}\n")
-    limits = ("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
-              " quick_stop_rad_s2: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n")
-    real = f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{limits}"
+    real = f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n" + limits_text(watchdog_s=None)
     (folder / "real.yaml").write_text(real + "service: {motion: attended}\n")
     (folder / "never.yaml").write_text(real)
     (folder / "watched.yaml").write_text(real + "service: {motion: watched}\n")

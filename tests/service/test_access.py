@@ -503,7 +503,7 @@ def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guar
     for more in ("allow_reverse: true\n", "run: {simulate: true}\n", "profile: ../../etc/passwd\n", "node: 3\n"):
         save(before + more, 403)
     save(before.replace("attended", "watched"), 403)
-    assert "real.yaml:2" in save(before.replace("torque_nm: 400.0", "torque_nm: <b>"), 422)["error"]["message"]
+    assert "real.yaml:5" in save(before.replace("torque_nm: 400.0", "torque_nm: <b>"), 422)["error"]["message"]
     save(before.replace("torque_nm: 400.0", "torque_nm: -1"), 422)
     save("&a [*a, *a]", 422)
     save("", 422)

@@ -18,7 +18,7 @@ from tdhil.service.run_state import State, Watch, now
 from tdhil.service.start_request import read_rig
 from tdhil.service.store import CONNECTION_FILE, Store, StoredRequest, read_json, write_json
 from tests.service.conftest import Service, wait_for
-from tests.service.test_lost_run import LIMITS
+from tests.service.test_lost_run import attended_rig
 
 SIMULATED = "run: {simulate: true}\n"
 
@@ -86,7 +86,7 @@ def test_a_rig_s_file_that_was_changed_before_the_process_began_ends_it(tmp_path
 @pytest.mark.heavy
 def test_where_its_drive_is_is_kept_before_the_bus_is_opened(tmp_path, nobody_s_port):
     """Nobody answers there, so that the run fails at its first word to the drive."""
-    asked = Asked(tmp_path, f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{LIMITS}", simulated=False)
+    asked = Asked(tmp_path, attended_rig(nobody_s_port), simulated=False)
     assert asked.serve() == ExitCode.REFUSED
     assert f"127.0.0.1:{nobody_s_port}" in asked.store.status(asked.run).error.message
     plan, status = read_json(asked.folder / "plan.json"), asked.store.status(asked.run)
@@ -103,7 +103,7 @@ def test_a_run_that_cannot_keep_where_its_drive_is_opens_no_bus(tmp_path, nobody
         if path.name == CONNECTION_FILE:
             raise OSError(28, "No space left on device")
 
-    asked = Asked(tmp_path, f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{LIMITS}", simulated=False)
+    asked = Asked(tmp_path, attended_rig(nobody_s_port), simulated=False)
     monkeypatch.setattr("tdhil.service.run_process.write_json", full)
     assert asked.serve() == ExitCode.INTERNAL
     assert "No space" in asked.store.status(asked.run).error.message

@@ -27,13 +27,9 @@ from tdhil.service import AccountsFile, attend, server
 from tdhil.service.client import ServiceError
 from tdhil.service.server import require_way
 from tdhil.service.store import Store
+from tests.rigs import PATIENT, rig_file
 from tests.service.conftest import HANGS_S, folder_of_locks, wait_for
 
-PATIENT = """run: {simulate: true}
-limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
-  watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}
-"""
-"""A rig in real time that bears a busy computer: half of its watchdog's time is the longest pause of a loop."""
 QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
 
 
@@ -156,7 +152,7 @@ def test_its_end_brakes_what_moves(tmp_path):
     """SIGTERM, as of `systemctl stop`: the shaft is at rest before the service ends. A stop of a page comes to the
     same."""
     (tmp_path / "rigs").mkdir()
-    (tmp_path / "rigs" / "rig.yaml").write_text(f"drive: modbus\n{PATIENT}")
+    rig_file(tmp_path / "rigs", "drive: modbus\nrun: {simulate: true}\n", PATIENT)
     with served(tmp_path / "data", "--rigs", str(tmp_path / "rigs")) as server:
         run = server.client.start("rig", real_time=True)["id"]
         wait_for("motion", lambda: server.client.run(run)["state"] == "moving")
@@ -175,7 +171,7 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
     """The run's own process counts: there is no web any more that could tell it."""
     rigs, data = tmp_path / "rigs", tmp_path / "data"
     rigs.mkdir()
-    (rigs / "rig.yaml").write_text(f"rate_hz: 20\n{PATIENT}service: {{motion: watched}}\n")
+    rig_file(rigs, "rate_hz: 20\nrun: {simulate: true}\n", PATIENT, "service: {motion: watched}\n")
     with served(data, "--rigs", str(rigs)) as server:
         with pytest.raises(UsageError, match="no service runs"):
             attend(tmp_path, print)
