@@ -9,7 +9,6 @@ from drivers import ethercat as driver
 from drivers.errors import DataFileError
 from drivers.ethercat.segment import EthercatSegment
 from profiles.library import load_profile
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tdhil.buses import ethercat
 from tdhil.cli.main import main
 from tdhil.config.rig import load_rig
@@ -17,13 +16,11 @@ from tdhil.errors import UsageError
 from tests.drivers.fake_soem import FakeMaster, FakeSlave
 from tests.rigs import loaded_rig
 
-STILL = RigParams(noise=QUIET, reporting=FAITHFUL)
-
 
 @pytest.fixture
 def segment(monkeypatch):
     """Two slaves behind every interface; the second has an alias."""
-    slaves = [FakeSlave(STILL, alias=alias, clocks=True) for alias in (0, 7)]
+    slaves = [FakeSlave(alias=alias, clocks=True) for alias in (0, 7)]
     found = EthercatSegment(FakeMaster(*slaves), "eth9")
     said = SimpleNamespace(driven="", slaves=slaves)
 

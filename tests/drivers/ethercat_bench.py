@@ -7,9 +7,9 @@ from drivers.drive import Mode, PowerState
 from drivers.ethercat.drive import EthercatDrive
 from drivers.ethercat.segment import EthercatSegment
 from profiles.library import load_profile
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS
 from tests.drivers.fake_soem import LSB_NM, LSB_RAD_S, FakeMaster, FakeSlave
+from tests.rigs import QUIET_RIG
 
 WATCHDOG = "0420h"
 # 6041h 6077h 606Ch 6061h 6074h; 6040h 6071h 60FFh 6060h
@@ -28,8 +28,8 @@ class EthercatBench:
     limits, rated_nm, has_limits = LIMITS, 1000.0, True
     speed_lsb, torque_lsb, ramp_rad_s2, ramp_rel = LSB_RAD_S, LSB_NM, LIMITS.quick_stop_rad_s2, 0.05
 
-    def __init__(self, params=None, *, seed=0, clock=None, clocks=False, **options):
-        self.slave = FakeSlave(params or RigParams(noise=QUIET, reporting=FAITHFUL), seed, clocks=clocks)
+    def __init__(self, params=QUIET_RIG, *, seed=0, clock=None, clocks=False, **options):
+        self.slave = FakeSlave(params, seed, clocks=clocks)
         self.slave.man, self.slave.id = 4, 4
         self.slave.drive.data[0x1018, 1] = self.slave.drive.data[0x1018, 2] = (4).to_bytes(4, "little")
         self.master, self.frames = FakeMaster(self.slave), []

@@ -8,6 +8,7 @@ import struct
 
 from profiles import MARKER_INDEX
 from tests.drivers.memory_bench import LSB_NM, LSB_RAD_S, MemoryDrive
+from tests.rigs import QUIET_RIG
 
 OUT, IN, SIZE = 0x1000, 0x1100, 128
 ABORT_NO_OBJECT = 0x06020000
@@ -20,7 +21,7 @@ class WkcError(Exception):
 class FakeSlave:
     """One slave of a `FakeMaster`."""
 
-    def __init__(self, params, seed=0, *, clocks=False, alias=0):
+    def __init__(self, params=QUIET_RIG, seed=0, *, clocks=False, alias=0):
         self.drive = MemoryDrive(params, seed)
         application = self.drive.application
         self.name, self.man, self.id, self.rev = "fake", 1, 2, 3

@@ -20,8 +20,8 @@ from profiles import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from profiles.library import load_canopen_profile
 from sim_bus.cia402 import Application
 from sim_bus.inverter import Inverter
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS
+from tests.rigs import QUIET_RIG
 
 RPM = math.pi / 30.0
 LSB_RAD_S, LSB_NM = 0.1 * RPM, 1.0
@@ -193,8 +193,8 @@ class MemoryBench:
     limits, rated_nm, has_limits = LIMITS, 1000.0, True
     speed_lsb, torque_lsb, ramp_rad_s2, ramp_rel = LSB_RAD_S, LSB_NM, LIMITS.quick_stop_rad_s2, 0.05
 
-    def __init__(self, params=None, *, seed=0, rate_hz=250.0):
-        self.memory = MemoryDrive(params or RigParams(noise=QUIET, reporting=FAITHFUL), seed)
+    def __init__(self, params=QUIET_RIG, *, seed=0, rate_hz=250.0):
+        self.memory = MemoryDrive(params, seed)
         profile, self.frames = load_canopen_profile("generic/cia402"), []
         bus = MemoryBus(self.memory, profile, SteppedClock(), 1.0 / rate_hz, self.frames.append)
         self.drive = Cia402Drive(bus, profile, fixed_rate=True)

@@ -11,8 +11,8 @@ from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive, LineTiming
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS, RPM
+from tests.rigs import QUIET_RIG
 
 
 class ModbusBench:
@@ -30,13 +30,13 @@ class ModbusBench:
     has_limits = True
     safe_action = "quick_stop"
 
-    def __init__(self, params=None, *, seed=0, timing=None, **options):
+    def __init__(self, params=QUIET_RIG, *, seed=0, timing=None, **options):
         self.limits = LIMITS
         self.rated_nm = 1000.0
         self.speed_lsb, self.torque_lsb = 0.01 * RPM, 1.0
         profile = load_modbus_profile("generic/modbus")
         self.simulated = EmbeddedModbusDrive(
-            params or RigParams(noise=QUIET, reporting=FAITHFUL), profile, seed=seed,
+            params, profile, seed=seed,
             timing=LineTiming() if timing is None else timing,
         )
         self.clock = SteppedClock()

@@ -18,8 +18,8 @@ from drivers.preflight import PreflightTable
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from sim_bus.modbus.embedded import EmbeddedModbusDrive, LineTiming
 from sim_bus.modbus.parameters import reporting_lag_s
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.profiles.golden import Exchange, Golden, Means, load, names, pdu
+from tests.rigs import QUIET_RIG
 
 NAMES = names()
 CASES = [
@@ -172,7 +172,7 @@ def test_filters(name: str) -> None:
 def test_the_simulated_drive_answers(name: str) -> None:
     golden = load(name)
     profile = worn(golden.profile)
-    rig = RigParams(noise=QUIET, reporting=FAITHFUL)
+    rig = QUIET_RIG
     rig = rig.model_copy(update={"drive": rig.drive.model_copy(update={"rated_torque_nm": golden.rated_torque_nm})})
     simulated = EmbeddedModbusDrive(rig, profile, unit=profile.line.unit, timing=LineTiming())
     parameters, reporting = simulated.machine.parameters, simulated.machine.inverter.reporting

@@ -8,7 +8,8 @@ import can
 import pytest
 
 from sim_bus.canopen.simulator import EmbeddedSimulator
-from sim_bus.params import FAITHFUL, QUIET, RigParams
+from sim_bus.params import RigParams
+from tests.rigs import QUIET_RIG
 
 SIZES = {1: ("B", 0x2F), 2: ("H", 0x2B), 4: ("I", 0x23)}
 
@@ -108,7 +109,6 @@ class Host:
 
 
 Bench = tuple[EmbeddedSimulator, Host]
-QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.wrong_maps import parse
-from sim_bus.params import FAITHFUL, QUIET, RigParams
+from sim_bus.params import RigParams
+from tests.rigs import QUIET_RIG
 
-QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
 GENERIC = load_modbus_profile("generic/modbus")
 
 

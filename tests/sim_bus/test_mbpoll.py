@@ -20,7 +20,7 @@ from sim_bus.modbus.lines import RequestListener, RtuListener, TcpListener
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.server import DriveServer
 from tests.path.path_runs import wait_for
-from tests.sim_bus.modbus_host import QUIET_RIG
+from tests.rigs import QUIET_RIG
 
 pytestmark = pytest.mark.real_time
 WHY = "no mbpoll on this machine: no independent host has read the simulated drive; apt-get install mbpoll"

@@ -6,7 +6,7 @@ import pytest
 from sim_bus.cia402 import Application, OperationMode
 from sim_bus.inverter import Inverter
 from sim_bus.modbus.control_words import FAMILIES, Wiring
-from tests.sim_bus.modbus_host import QUIET_RIG
+from tests.rigs import QUIET_RIG
 
 STEP_S = 0.002
 

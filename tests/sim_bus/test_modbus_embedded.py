@@ -13,7 +13,8 @@ from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
-from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
+from tests.rigs import QUIET_RIG
+from tests.sim_bus.modbus_host import GENERIC, GenericHost, drive
 
 RPM = 2 * pi / 60
 

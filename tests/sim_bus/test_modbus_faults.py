@@ -21,7 +21,8 @@ from sim_bus.modbus.faults import KINDS, ONLY_ON, WRONGS, Faults, parse_all
 from sim_bus.modbus.lines import RtuListener, TcpListener, crc
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.server import DriveServer
-from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
+from tests.rigs import QUIET_RIG
+from tests.sim_bus.modbus_host import GENERIC, GenericHost, drive
 
 READ = struct.pack(">BHH", 3, 42, 2)
 PATTERN = bytes.fromhex("030412345678")

@@ -11,7 +11,8 @@ from profiles.errors import TdhilError
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.codec import RegisterLayout
 from sim_bus.params import DriveParams, ReportingParams, RigParams
-from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, Host, Refusal, drive
+from tests.rigs import QUIET_RIG
+from tests.sim_bus.modbus_host import GENERIC, GenericHost, Host, Refusal, drive
 
 FORMATS = {"u16": "H", "i16": "h", "u32": "I", "i32": "i"}
 SOURCE = {"source": "for this test", "confidence": "verified"}

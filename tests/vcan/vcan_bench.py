@@ -12,8 +12,8 @@ from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.simulator import Simulator
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS, CanopenBench, TamperedBus
+from tests.rigs import QUIET_RIG
 
 RECEIVE_BYTES = 4 << 20
 RATE_HZ = 50.0
@@ -25,7 +25,7 @@ class VcanBench(CanopenBench):
 
     LEAST_FRAMES = 800
 
-    def __init__(self, interface, params=None, *, seed=0, rate_hz=RATE_HZ, **options):
+    def __init__(self, interface, params=QUIET_RIG, *, seed=0, rate_hz=RATE_HZ, **options):
         def open_bus():
             return can.Bus(interface="socketcan", channel=interface)
 
@@ -34,7 +34,7 @@ class VcanBench(CanopenBench):
         # The second station is asked seldom: what it has not fetched must find room.
         self._second.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         simulator = Simulator(
-            self._theirs, params or RigParams(noise=QUIET, reporting=FAITHFUL), seed=seed, stepped=True,
+            self._theirs, params, seed=seed, stepped=True,
             silence_s=float("inf"),
         )
         self.simulated = SimpleNamespace(simulator=simulator)

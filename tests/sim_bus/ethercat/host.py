@@ -4,9 +4,9 @@ import struct
 
 from profiles.ethercat import EthercatProfile
 from sim_bus.ethercat import Simulator
-from sim_bus.params import FAITHFUL, QUIET, RigParams
+from sim_bus.params import RigParams
+from tests.rigs import QUIET_RIG
 
-QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
 APRD, APWR, APRW, FPRD, FPWR, FPRW, BRD, BWR, BRW, LRD, LWR, LRW, ARMW, FRMW = range(1, 15)
 STATION = 0x1001
 INIT, PREOP, SAFEOP, OP = 1, 2, 4, 8
