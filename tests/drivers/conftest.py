@@ -1,5 +1,6 @@
 import sys
 import time
+from pkgutil import resolve_name
 
 import pytest
 
@@ -40,52 +41,23 @@ def profile():
     return load_canopen_profile("generic/cia402")
 
 
-def _canopen():
+@pytest.fixture
+def bench():
+    """CanopenDrive on the embedded simulator."""
     from tests.drivers.drive_benches import CanopenBench
 
-    return CanopenBench
-
-
-def _modbus():
-    from tests.drivers.modbus_bench import ModbusBench
-
-    return ModbusBench
-
-
-def _epos4():
-    from tests.drivers.profile_benches import Epos4Bench
-
-    return Epos4Bench
-
-
-def _s120():
-    from tests.drivers.profile_benches import S120Bench
-
-    return S120Bench
-
-
-def _abb():
-    from tests.drivers.profile_benches import AbbBench
-
-    return AbbBench
-
-
-def _memory():
-    from tests.drivers.memory_bench import MemoryBench
-
-    return MemoryBench
-
-
-def _ethercat():
-    from tests.drivers.ethercat_bench import EthercatBench
-
-    return EthercatBench
+    bench = CanopenBench()
+    yield bench
+    bench.close()
 
 
 MAKERS = {
-    "abb-fcan": _abb, "canopen": _canopen, "epos4": _epos4, "ethercat": _ethercat, "memory": _memory,
-    "modbus": _modbus, "s120-canopen": _s120,
+    "abb-fcan": "profile_benches.AbbBench", "canopen": "drive_benches.CanopenBench",
+    "epos4": "profile_benches.Epos4Bench", "ethercat": "ethercat_bench.EthercatBench",
+    "memory": "memory_bench.MemoryBench", "modbus": "modbus_bench.ModbusBench",
+    "s120-canopen": "profile_benches.S120Bench",
 }
+"""Benches by their module in tests/drivers, which a test loads when it needs it."""
 
 
 @pytest.fixture(params=[
@@ -96,15 +68,10 @@ MAKERS = {
 ])
 def make_bench(request):
     """Makes benches of one kind of drive (see drive_benches); a further kind joins the contract by its line above."""
-    made = []
+    from tests.drivers.drive_benches import opened
 
-    def make(*args, **options):
-        made.append(MAKERS[request.param]()(*args, **options))
-        return made[-1]
-
-    yield make
-    for bench in made:
-        bench.close()
+    with opened(resolve_name(f"tests.drivers.{MAKERS[request.param]}")) as make:
+        yield make
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ A bench has ``drive`` (not yet connected), ``frames`` (what its tap saw), ``limi
 import math
 import struct
 from collections import deque
+from contextlib import ExitStack, contextmanager
 
 import can
 
@@ -20,7 +21,7 @@ from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.inline import InlineSimulator
-from sim_bus.params import FAITHFUL, QUIET, RigParams
+from tests.rigs import QUIET_RIG
 
 LIMITS = DriveLimits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_wider=frozenset({"quick-stop"})
@@ -88,12 +89,12 @@ class CanopenBench:
     has_limits = True              # that a run can set
     safe_action = "quick_stop"
 
-    def __init__(self, params=None, *, seed=0, **options):
+    def __init__(self, params=QUIET_RIG, *, seed=0, **options):
         self.limits = LIMITS
         self.rated_nm = 1000.0
         profile = load_canopen_profile(self.PROFILE)
         self.simulated = InlineSimulator(
-            params or RigParams(noise=QUIET, reporting=FAITHFUL), seed=seed, profile=profile if self.WORN else None
+            params, seed=seed, profile=profile if self.WORN else None
         ).open()
         self._second = self.simulated.station()
         self.bus = TamperedBus(self.simulated.station())
@@ -160,6 +161,18 @@ class CanopenBench:
     def setpoints(self, frames):
         words = [struct.unpack("<Hhi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
         return [(speed * 0.1 * RPM, torque * 1.0) for _, torque, speed in words]
+
+
+@contextmanager
+def opened(maker):
+    """Yield a function that makes benches, which are closed afterwards."""
+    with ExitStack() as stack:
+        def make(*arguments, **options):
+            bench = maker(*arguments, **options)
+            stack.callback(bench.close)
+            return bench
+
+        yield make
 
 
 class Run:

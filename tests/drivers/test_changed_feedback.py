@@ -9,7 +9,7 @@ import pytest
 from drivers.canopen.pdo_mapping import DISABLED
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost
-from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.drive_benches import Run
 
 FRAMES = 4 + 4 + 4 + 4                 # 1800h:1, 2, 3, 5; 1A00h:0 to 3; the same of 1801h and 1A01h
 TURN_S, GROUPS = 0.5, 3
@@ -17,12 +17,10 @@ ROUND_S = TURN_S * GROUPS * FRAMES
 
 
 @pytest.fixture
-def run():
-    bench = CanopenBench()
+def run(bench):
     run = Run(bench)
     run.turning(2.0)
-    yield run
-    bench.close()
+    return run
 
 
 def panel(run, *writes):

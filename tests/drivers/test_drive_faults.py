@@ -6,31 +6,21 @@ import itertools
 import can
 import pytest
 
-from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, DriveLimits, Mode, PowerState
+from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault
-from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.drive_benches import Run
+from tests.drivers.on_wire import LIMITS, enabled, prepared
 from tests.drivers.power_machine import ENABLED
 
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 PERIOD_S = 0.004
-
-
-@pytest.fixture
-def bench():
-    bench = CanopenBench()
-    yield bench
-    bench.close()
 
 
 @pytest.fixture
 def turning(bench):
     """The shaft turns at about 2 rad/s."""
     run = Run(bench)
-    run.ready()
-    run.enable()
-    run.go(2.0, speed=2.0)
+    run.turning(2.0, 2.0)
     return run
 
 
@@ -156,29 +146,17 @@ def test_closing_on_a_dead_bus_does_not_raise(turning, bench):
 
 @pytest.fixture(params=["stepped", "real time"])
 def numbered(request, wire, peer, profile, fake_time):
-    clock = SteppedClock() if request.param == "stepped" else MonotonicClock()
-    drive = CanopenDrive(wire, profile, clock, node=1)
-    drive.connect()
-    assert drive.preflight(LIMITS).refused == ()
-    drive.enable(Mode.SPEED)
-    return drive
+    return enabled(wire, profile, clock=SteppedClock() if request.param == "stepped" else MonotonicClock())
 
 
 @pytest.fixture
 def stepped_drive(wire, peer, profile, fake_time):
-    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
-    drive.connect()
-    assert drive.preflight(LIMITS).refused == ()
-    drive.enable(Mode.SPEED)
-    return drive
+    return enabled(wire, profile)
 
 
 @pytest.fixture
 def in_real_time(wire, peer, profile, fake_time):
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    drive.preflight(LIMITS)
-    drive.enable(Mode.SPEED)
+    drive = enabled(wire, profile, clock=MonotonicClock())
     for _ in range(10):
         drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
     return drive
@@ -258,9 +236,7 @@ def test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on(stepped_drive, pe
 
 def test_questions_are_no_part_of_the_log(wire, peer, profile, fake_time):
     frames = []
-    drive = CanopenDrive(wire, profile, SteppedClock(), node=1, tap=frames.append)
-    drive.connect()
-    drive.preflight(LIMITS)
+    drive = prepared(wire, profile, tap=frames.append)
     wire.on_send = answered_questions(wire, wire.on_send, 0.01)
     peer.answer_sync = lambda cycle: []
     exchange(drive, 5)
@@ -407,8 +383,6 @@ def test_speed_zero_counts_in_profile_velocity_only(wire, peer, profile):
     """Bit 12 means something else in the cyclic modes."""
     for supported, standstill in ((1 << 2, True), (1 << 8, False)):
         peer.objects[0x6502, 0] = supported.to_bytes(4, "little")
-        drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
-        drive.connect()
-        drive.preflight(LIMITS)
+        drive = prepared(wire, profile)
         peer.answer_sync = lambda cycle: [(0.0002, bytes.fromhex("37120000") + bytes(4))]
         assert exchange(drive, 12)[-1].standstill is standstill

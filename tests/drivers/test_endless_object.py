@@ -4,14 +4,7 @@ import pytest
 
 from drivers.errors import CommunicationLost, PreflightRefused
 from sim_bus.objects import key_of
-from tests.drivers.drive_benches import CanopenBench, Run
-
-
-@pytest.fixture
-def bench():
-    made = CanopenBench()
-    yield made
-    made.close()
+from tests.drivers.drive_benches import Run
 
 
 class EndlessUploads:

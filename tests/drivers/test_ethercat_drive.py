@@ -17,12 +17,9 @@ from drivers.ethercat.segment import EthercatSegment
 from drivers.quick_stop import Ended, bare_stop
 from profiles import MessageCode
 from profiles.library import load_profile
-from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS, Run
 from tests.drivers.ethercat_bench import EthercatBench
 from tests.drivers.fake_soem import FakeMaster, FakeSlave
-
-STILL = RigParams(noise=QUIET, reporting=FAITHFUL)
 
 
 @pytest.fixture
@@ -33,9 +30,7 @@ def bench():
 @pytest.fixture
 def turning(bench):
     run = Run(bench)
-    run.ready()
-    run.enable()
-    run.go(0.4, speed=1.0)
+    run.turning(1.0, 0.4)
     return run
 
 
@@ -202,13 +197,13 @@ def test_a_slave_whose_sii_and_objects_differ_is_refused(bench):
     (2, {"alias": 5}, "2 slaves are with station alias 5"),
 ])
 def test_a_drive_that_is_not_there_is_refused(slaves, options, said):
-    master = FakeMaster(*(FakeSlave(STILL, alias=5) for _ in range(slaves)))
+    master = FakeMaster(*(FakeSlave(alias=5) for _ in range(slaves)))
     with pytest.raises(PreflightRefused, match=said):
         EthercatSegment(master, "fake0", **options)
 
 
 def test_a_drive_is_found_by_its_alias():
-    segment = EthercatSegment(FakeMaster(FakeSlave(STILL, alias=5), FakeSlave(STILL, alias=7)), "fake0", alias=7)
+    segment = EthercatSegment(FakeMaster(FakeSlave(alias=5), FakeSlave(alias=7)), "fake0", alias=7)
     assert segment.position == 1
 
 

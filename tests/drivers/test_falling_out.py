@@ -2,31 +2,17 @@
 
 import pytest
 
-from drivers.canopen.drive import CanopenDrive
-from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode, PowerState
+from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost
+from tests.drivers.on_wire import cycles, enabled
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, READY
 from tests.drivers.scripted_drive import TPDO1
-
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
-TURN = Command(Mode.SPEED, 1.0, 0.0)
-
-
-def cycles(drive, wire, count=20):
-    for _ in range(count):
-        wire.put(0x701, b"\x05")
-        state = drive.exchange(TURN).state
-    return state
 
 
 @pytest.fixture
 def drive(wire, peer, profile):
-    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
-    drive.connect()
-    drive.preflight(LIMITS)
-    drive.enable(Mode.SPEED)
-    assert cycles(drive, wire) is PowerState.ENABLED
+    drive = enabled(wire, profile)
+    assert cycles(drive, wire).state is PowerState.ENABLED
     return drive
 
 
@@ -35,17 +21,17 @@ def drive(wire, peer, profile):
 ])
 def test_it_stays_out(drive, wire, peer, state, shown):
     peer.machine.state = state
-    assert cycles(drive, wire) is shown
+    assert cycles(drive, wire).state is shown
     begin = len(peer.setpoints)
-    assert cycles(drive, wire, 100) is shown
+    assert cycles(drive, wire, 100).state is shown
     assert all(word & 0x0F != 0x0F for word, _, _ in peer.setpoints[begin:])
 
 
 def test_it_comes_back_when_asked_in_again(drive, wire, peer):
     peer.machine.state = OFF
-    assert cycles(drive, wire) is PowerState.OFF
+    assert cycles(drive, wire).state is PowerState.OFF
     drive.enable(Mode.SPEED)
-    assert cycles(drive, wire) is PowerState.ENABLED
+    assert cycles(drive, wire).state is PowerState.ENABLED
     assert peer.machine.state == ENABLED
 
 
@@ -53,7 +39,7 @@ def test_one_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog(drive, 
     """A statusword of zero, whoever made it one, is no proof that the drive is off."""
     armed = peer.value(0x1016, 1)
     peer.tpdo = lambda cycle: TPDO1.pack(0, 0, 50_000)
-    assert cycles(drive, wire) is PowerState.UNKNOWN
+    assert cycles(drive, wire).state is PowerState.UNKNOWN
     written = len(peer.writes)
     drive.close()
     assert peer.value(0x1016, 1) == armed != 0
@@ -74,17 +60,13 @@ def test_a_drive_that_is_switched_to_another_control_place_ends_the_run(drive, w
 
 def test_a_drive_that_never_sets_that_bit_is_not_judged_by_it(wire, peer, profile):
     peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0)
-    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
-    drive.connect()
-    drive.preflight(LIMITS)
-    drive.enable(Mode.SPEED)
-    assert cycles(drive, wire, 100) is PowerState.ENABLED
+    assert cycles(enabled(wire, profile), wire, 100).state is PowerState.ENABLED
 
 
 def test_one_frame_without_it_is_an_accident(drive, wire, peer):
     plain, few = peer.tpdo, iter((True, True, False) * 100)
     peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0) if next(few) else plain(cycle)
-    assert cycles(drive, wire, 60) is PowerState.ENABLED
+    assert cycles(drive, wire, 60).state is PowerState.ENABLED
 
 
 @pytest.mark.parametrize("target", [0, 1])
@@ -100,5 +82,5 @@ def test_pre_operational_and_start_in_quick_succession_are_noticed(drive, wire, 
 def test_commands_to_other_nodes_and_a_start_are_no_trouble(drive, wire):
     wire.put(0x000, bytes((0x80, 5)))
     wire.put(0x000, bytes((0x01, 0)))
-    assert cycles(drive, wire, 20) is PowerState.ENABLED
+    assert cycles(drive, wire, 20).state is PowerState.ENABLED
     assert drive.remarks() == ("another master sent NMT start to all nodes",)

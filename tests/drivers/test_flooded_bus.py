@@ -6,13 +6,12 @@ import can
 import pytest
 
 from drivers.canopen.bus import STOP_DRAIN_S, CanLink
-from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.quick_stop import CanopenTarget
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, Mode
 from drivers.errors import CommunicationLost
+from tests.drivers.on_wire import cycles, enabled
 
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 READ_S = 0.0001
 """Time to read one frame, s."""
 AT_ONCE_S = 4.0 * STOP_DRAIN_S
@@ -44,13 +43,8 @@ def times(wire):
 
 @pytest.fixture
 def running(wire, peer, profile):
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    assert drive.preflight(LIMITS).refused == ()
-    drive.enable(Mode.SPEED)
-    for _ in range(100):
-        wire.put(0x701, b"\x05")
-        drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    drive = enabled(wire, profile, clock=MonotonicClock())
+    cycles(drive, wire, 100, Command(Mode.SPEED, 0.0, 0.0))
     return drive
 
 

@@ -3,24 +3,24 @@
 On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
 """
 
+from dataclasses import replace
+
 import pytest
 
 from drivers.canopen.drive import CanopenDrive
 from drivers.clock import LOWER_THE_RATE, MonotonicClock, SteppedClock, Ticks, how_late
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, Mode
 from drivers.errors import CommunicationLost
+from tests.drivers import on_wire
+from tests.drivers.on_wire import TURN, enabled
+from tests.rigs import DRIVE_LIMITS
 
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
-TURN = Command(Mode.SPEED, 1.0, 0.0)
 PERIOD_S = 0.004
 
 
 @pytest.fixture
 def drive(wire, peer, profile, fake_time):
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    drive.preflight(LIMITS)
-    drive.enable(Mode.SPEED)
+    drive = enabled(wire, profile, DRIVE_LIMITS, MonotonicClock())
     for _ in range(10):
         drive.exchange(TURN)
     return drive
@@ -226,10 +226,7 @@ def test_time_spent_well_is_not_overslept(fake_time):
 @pytest.fixture
 def prepared(wire, peer, profile, fake_time):
     peer.objects[0x1006, 0] = bytes(4)
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    assert drive.preflight(LIMITS).refused == ()
-    return drive
+    return on_wire.prepared(wire, profile, DRIVE_LIMITS, MonotonicClock())
 
 
 def test_another_rate_is_written_before_anything_is_enabled(prepared, peer, wire, fake_time):
@@ -264,9 +261,7 @@ def test_standing_still_is_no_error_while_a_rate_is_tried_and_one_afterwards(pre
 
 
 def test_a_short_watchdog_leaves_no_slow_rate(wire, peer, profile, fake_time):
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.06))
+    drive = on_wire.prepared(wire, profile, replace(DRIVE_LIMITS, watchdog_s=0.06), MonotonicClock())
     assert drive.rates_hz == (250.0, 200.0, 125.0, 100.0)
 
 

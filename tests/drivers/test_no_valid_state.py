@@ -20,33 +20,22 @@ from drivers.quick_stop import Ended, bare_stop
 from profiles.library import load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
-from sim_bus.params import FAITHFUL, QUIET, RigParams
-from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL, SPEED, STATUS, Bank
+from tests.drivers.on_wire import LIMITS, cycles, prepared
 from tests.drivers.power_machine import ENABLED, STOPPING
 from tests.drivers.scripted_drive import TPDO1
 from tests.drivers.test_modbus_drive import GENERIC
 from tests.drivers.test_modbus_drive import Run as BankRun
+from tests.rigs import QUIET_RIG
 
 MODBUS = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
-TURN = Command(Mode.SPEED, 1.0, 0.0)
 DEAD = (b"\0" * 8, b"\xff" * 8)
-
-
-def cycles(drive, wire, count=20):
-    for _ in range(count):
-        wire.put(0x701, b"\x05")
-        sample = drive.exchange(TURN)
-    return sample
 
 
 @pytest.fixture
 def fresh(wire, peer, profile):
-    drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
-    drive.connect()
-    drive.preflight(LIMITS)
-    return drive
+    return prepared(wire, profile)
 
 
 @pytest.fixture
@@ -107,8 +96,7 @@ def test_it_may_be_so_again_after_its_boot_up_message(drive, wire, peer):
     assert cycles(drive, wire, 3).state is PowerState.NOT_READY
 
 
-def test_a_look_by_sdo_repeats_the_quick_stop_of_one_that_shows_no_state():
-    bench = CanopenBench()
+def test_a_look_by_sdo_repeats_the_quick_stop_of_one_that_shows_no_state(bench):
     run = Run(bench)
     run.turning(2.0)
     store = bench.simulated.simulator.node.store
@@ -119,7 +107,6 @@ def test_a_look_by_sdo_repeats_the_quick_stop_of_one_that_shows_no_state():
     words = [struct.unpack("<H", data[4:6])[0] for identifier, data in bench.heard()
              if identifier == 0x601 and data[:3] == b"\x2b\x40\x60"]
     assert words == [0x0002]
-    bench.close()
 
 
 def test_one_that_shows_no_state_is_refused(wire, peer, profile):
@@ -146,7 +133,7 @@ def test_of_every_family_ones_are_no_state_and_zeros_none_after_it_was_enabled(p
 @pytest.mark.parametrize("profile", MODBUS, ids=lambda one: one.name)
 def test_a_good_run_of_every_family_shows_a_valid_state_in_every_cycle(profile):
     """The simulated drive speaks as its family's manual has it, not as the profile does."""
-    simulated = EmbeddedModbusDrive(RigParams(noise=QUIET, reporting=FAITHFUL), profile)
+    simulated = EmbeddedModbusDrive(QUIET_RIG, profile)
     drive = ModbusDrive(
         EmbeddedLink(simulated.serve, SteppedClock()), profile, unit=1, given=dict(simulated.untold),
         rated_torque_nm=None if profile.rated_torque else simulated.rated_torque_nm,
@@ -236,8 +223,7 @@ def test_a_stop_from_outside_takes_no_speed_of_a_blank_status_for_rest(status):
 
 
 @pytest.mark.heavy
-def test_a_stop_from_outside_on_canopen_too():
-    bench = CanopenBench()
+def test_a_stop_from_outside_on_canopen_too(bench):
     run = Run(bench)
     run.turning(2.0)
     store = bench.simulated.simulator.node.store
@@ -246,4 +232,3 @@ def test_a_stop_from_outside_on_canopen_too():
     report = bare_stop(target, SteppedClock())
     assert report.ended is Ended.TURNING
     assert any("0000h" in line for line in report.remarks)
-    bench.close()

@@ -12,21 +12,21 @@ import pytest
 
 from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode, Outcome
+from drivers.drive import Command, Mode, Outcome
 from drivers.errors import CommunicationLost
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
+from tests.drivers import drive_benches
 from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL, TIME_OUT, Bank
+from tests.drivers.on_wire import TURN, cycles, enabled
 from tests.drivers.power_machine import ENABLED, STOPPING
 from tests.drivers.profile_benches import S120Bench
 
-LIMITS = DriveLimits(
-    speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_no_watchdog=True,
-    accept_wider=frozenset({"torque", "speed", "quick-stop"}),
-)
+LIMITS = replace(drive_benches.LIMITS, accept_no_watchdog=True,
+                 accept_wider=frozenset({"torque", "speed", "quick-stop"}))
 REACTION = 41
 
 
@@ -77,17 +77,12 @@ def test_a_full_queue_keeps_no_stop_back_where_no_watchdog_acts(wire, peer, prof
     """With one armed nothing more is sent: it acts on the silence. Without one the quick stop is all that there is."""
     none = {"kind": "none", "reaction": "none", "reaction_index": None, "reaction_value": None}
     watchdog = profile.watchdog.model_copy(update=none if kind == "none" else {})
-    drive = CanopenDrive(wire, profile.model_copy(update={"watchdog": watchdog}), SteppedClock(), node=1)
-    drive.connect()
-    assert drive.preflight(LIMITS).refused == ()
-    drive.enable(Mode.SPEED)
-    for _ in range(10):
-        wire.put(0x701, b"\x05")
-        drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
+    drive = enabled(wire, profile.model_copy(update={"watchdog": watchdog}), LIMITS)
+    cycles(drive, wire, 10)
     assert peer.machine.state == ENABLED
     wire.send_error = can.CanOperationError("transmit buffer full")
     with pytest.raises(CommunicationLost):
-        drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
+        drive.exchange(TURN)
     wire.send_error = None
     drive.quick_stop()
     for _ in range(3):

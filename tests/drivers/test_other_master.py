@@ -1,16 +1,16 @@
 """What another node, master or tool does beside this host, against the scripted drive: told, refused, or raised."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
 from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
+from tests.drivers.on_wire import LIMITS, enabled, prepared
 from tests.drivers.scripted_drive import u
-
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 
 
 @pytest.fixture
@@ -136,9 +136,7 @@ def test_a_setting_that_somebody_changes_in_motion_ends_the_run(running, wire, p
 
 def test_a_quick_stop_option_that_the_profile_does_not_set_is_read_back_and_restored_too(wire, peer, profile):
     stop = profile.quick_stop.model_copy(update={"option_code": None})
-    drive = CanopenDrive(wire, profile.model_copy(update={"quick_stop": stop}), SteppedClock(), node=1)
-    ready(drive)
-    drive.enable(Mode.SPEED)
+    drive = enabled(wire, profile.model_copy(update={"quick_stop": stop}))
     go(drive, wire, 3.0)
     assert not [entry for entry in peer.writes if entry[0] == 0x605A]
     peer.objects[0x605A, 0] = u(0, 2)
@@ -322,9 +320,7 @@ def test_its_frames_are_known_by_their_own_identifier(make, wire, peer):
 
 @pytest.mark.parametrize("rate_hz", [4.0, 50.0, 250.0])
 def test_a_mode_that_was_lost_shows_within_a_tenth_of_a_second_or_a_cycle(wire, peer, profile, rate_hz):
-    drive = CanopenDrive(wire, profile, SteppedClock(), node=1, rate_hz=rate_hz)
-    drive.connect()
-    drive.preflight(DriveLimits(10.0, 300.0, 2.0, 3.0))
+    prepared(wire, profile, replace(LIMITS, watchdog_s=3.0), rate_hz=rate_hz)
     syncs = peer.value(0x1801, 2)
     assert 1 <= syncs <= 5
     assert syncs / rate_hz <= max(0.1, 1.0 / rate_hz) + 1e-9
@@ -343,9 +339,7 @@ def test_a_mode_that_is_not_displayed_any_more_is_not_known(running, wire, peer)
 
 @pytest.mark.parametrize("watchdog_s", [0.1, 0.2, 0.4, 2.0])
 def test_a_short_watchdog_is_fed_five_times_in_its_time(wire, peer, profile, fake_time, watchdog_s):
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    drive.preflight(DriveLimits(10.0, 300.0, 2.0, watchdog_s))
+    drive = prepared(wire, profile, replace(LIMITS, watchdog_s=watchdog_s), MonotonicClock())
     sent, plain = [], wire.on_send
     wire.on_send = lambda identifier, data: (
         sent.append(fake_time.now_s) if identifier == 0x77F else None, plain(identifier, data)

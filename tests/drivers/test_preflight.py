@@ -6,12 +6,12 @@ import pytest
 
 from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, DriveLimits, Mode, Outcome
+from drivers.drive import Command, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
+from tests.drivers.on_wire import LIMITS
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, REACTION, STOPPING
 from tests.drivers.scripted_drive import ScriptedDrive, u
 
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 ROWS = [
     "identity", "state", "modes of operation", "rated torque", "angle of the motor", "torque limit", "speed limit",
     "quick-stop ramp", "quick-stop option", "temperature", "targets", "mode display for 9", "mode display for 10",

@@ -8,7 +8,7 @@ import pytest
 from drivers.canopen import bus
 from drivers.drive import Polled, PowerState
 from drivers.errors import CommunicationLost, DriveFault
-from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL
 from tests.drivers.power_machine import ENABLED, STOPPING
 from tests.drivers.test_modbus_drive import Run as BankRun
@@ -17,20 +17,11 @@ STATUS, SPEED = b"\x40\x41\x60\x00", b"\x40\x6c\x60\x00"      # SDO upload of 60
 
 
 @pytest.fixture
-def bench():
-    bench = CanopenBench()
-    yield bench
-    bench.close()
-
-
-@pytest.fixture
 def turning(bench, monkeypatch):
     monkeypatch.setattr(bus, "PEER_DEAD_S", 0.5)
     monkeypatch.setattr(bus, "PEER_STILL_DEAD_S", 0.001)
     run = Run(bench)
-    run.ready()
-    run.enable()
-    run.go(2.0, speed=2.0)
+    run.turning(2.0, 2.0)
     return run
 
 

@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import JUMP_S, FrameStamps
-from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, Mode
+from tests.drivers.on_wire import prepared
+from tests.rigs import DRIVE_LIMITS
 
 WALL_S = 1.7e9
 
@@ -83,9 +84,7 @@ def turned(peer, wire, profile, wall_of):
         return message
 
     wire.recv = stamped
-    drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
-    drive.connect()
-    drive.preflight(DriveLimits(10.0, 400.0, 2.0, 0.5))
+    drive = prepared(wire, profile, DRIVE_LIMITS, MonotonicClock())
     # The scripted drive has no heartbeat of its own.
     drive._bus.watch.allowed_silence_s = 0.0
     samples = [drive.exchange(Command(Mode.SPEED, 0.0, 0.0)) for _ in range(1000)]

@@ -10,18 +10,16 @@ from drivers.clock import SteppedClock
 from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommandRejected
 from profiles.library import load_canopen_profile
-from tests.drivers.drive_benches import LIMITS, CanopenBench, Run
+from tests.drivers.drive_benches import LIMITS, Run
 
 OFFSET = (0x60B2, 0)
 WITH_OFFSET = replace(LIMITS, torque_offset=True)
 
 
 @pytest.fixture
-def bench():
-    opened = CanopenBench()
-    opened.limits = WITH_OFFSET
-    yield opened
-    opened.close()
+def bench(bench):
+    bench.limits = WITH_OFFSET
+    return bench
 
 
 def turning(bench):
@@ -73,13 +71,12 @@ def test_it_is_zero_in_torque_mode(bench):
 
 
 @pytest.mark.heavy
-def test_it_is_refused_where_nobody_asked_for_it():
-    bench = CanopenBench()
+def test_it_is_refused_where_nobody_asked_for_it(bench):
+    bench.limits = LIMITS
     run = turning(bench)
     with pytest.raises(CommandRejected, match="none is mapped"):
         push(run, 1.0)
     assert all(len(frame.data) == 1 for frame in bench.frames if frame.identifier == 0x301)
-    bench.close()
 
 
 def test_preflight_refuses_a_drive_without_one(bench):

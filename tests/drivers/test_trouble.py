@@ -9,10 +9,9 @@ from drivers.canopen.bus import CanLink, Condition, condition, queue_is_full
 from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.supervision import NodeWatch
 from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
-
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+from tests.drivers.on_wire import LIMITS, cycles
 
 
 @pytest.fixture
@@ -131,9 +130,7 @@ def test_and_in_motion(drive, wire):
     drive.preflight(LIMITS)
     drive.enable(Mode.SPEED)
     for _ in range(2):
-        for _ in range(200):                       # 0.8 s
-            wire.put(0x701, b"\x05")
-            drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+        cycles(drive, wire, 200, Command(Mode.SPEED, 0.0, 0.0))         # 0.8 s
         wire.put(0x080, b"")
     with pytest.raises(CommunicationLost, match="second master"):
         drive.exchange(Command(Mode.SPEED, 0.0, 0.0))

@@ -1,18 +1,20 @@
 """What a host that died leaves in a drive: written down before it is changed, and given back by whoever comes next."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, Mode
 from drivers.errors import PreflightRefused
 from drivers.undo_journal import UndoJournal, read
+from tests.drivers import on_wire
 from tests.drivers.scripted_drive import ScriptedDrive, u
 
 ALL = frozenset({"torque", "speed", "quick-stop"})
-LIMITS = DriveLimits(10.0, 300.0, 2.0, 0.4, accept_wider=ALL)
+LIMITS = replace(on_wire.LIMITS, accept_wider=ALL)
 FOUND = {0x6072: 100, 0x6080: 40, 0x6085: 1910, 0x605A: 2, 0x6007: 1}
 
 
@@ -82,7 +84,7 @@ def test_the_next_run_gives_back_what_a_killed_one_left(make, real, wire, tmp_pa
     real.machine.state = "switch on disabled"
     assert real.value(0x6072) == 300
     drive = make()
-    found = run(drive, DriveLimits(10.0, 300.0, 2.0, 0.4))
+    found = run(drive, on_wire.LIMITS)
     assert (real.value(0x6072), real.value(0x6080), real.value(0x6085)) == (100, 40, 1910)
     assert found.kept_torque_nm == pytest.approx(100.0)
     (row,) = [check for check in found.checks if check.name == "left by an earlier run"]
@@ -97,7 +99,7 @@ def test_the_next_run_gives_back_what_a_killed_one_left(make, real, wire, tmp_pa
 def test_what_somebody_has_set_since_is_left_alone(make, real, tmp_path):
     run(make())
     real.objects[0x6072, 0] = u(77, 2)
-    run(make(), DriveLimits(10.0, 300.0, 2.0, 0.4))
+    run(make(), on_wire.LIMITS)
     assert real.value(0x6072) == 77
 
 
@@ -105,7 +107,7 @@ def test_another_drive_is_not_given_it(make, real, wire, tmp_path):
     run(make())
     real.objects[0x1018, 4] = u(0x45, 4)
     real.objects[0x6072, 0] = u(300, 2)
-    run(make(), DriveLimits(10.0, 300.0, 2.0, 0.4))
+    run(make(), on_wire.LIMITS)
     assert real.value(0x6072) == 300
 
 

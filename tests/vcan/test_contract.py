@@ -6,10 +6,12 @@ contract is the driver's own, whatever carries its frames: the benches of tests/
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from sim_bus.params import RigParams
-from tests.drivers.drive_benches import Run
+from tests.drivers.drive_benches import Run, opened
 from tests.drivers.test_drive_contract import (  # noqa: F401  (collected here)
     other_mode,
     test_a_quick_stop_brakes_on_the_ramp_and_holds,
@@ -27,15 +29,8 @@ from tests.vcan.vcan_bench import VcanBench
 
 @pytest.fixture
 def make_bench(vcan):
-    made = []
-
-    def make(*args, **options):
-        made.append(VcanBench(vcan, *args, **options))
-        return made[-1]
-
-    yield make
-    for bench in made:
-        bench.close()
+    with opened(partial(VcanBench, vcan)) as make:
+        yield make
 
 
 @pytest.fixture
