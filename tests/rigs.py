@@ -5,6 +5,7 @@ It is the rig of the simulated drive: 0.5 to 10 rad/s, 400 N·m, 15 minutes. A t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.drive import DriveLimits
@@ -21,7 +22,7 @@ NUMBERS = {
 LIMITS = MachineLimits(**NUMBERS)
 """The limits as the runner gets them."""
 
-DRIVE_LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
+DRIVE_LIMITS = DriveLimits(LIMITS.speed_max_rad_s, LIMITS.torque_nm, LIMITS.quick_stop_rad_s2, LIMITS.watchdog_s)
 """The limits as a drive gets them."""
 
 QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
@@ -29,6 +30,24 @@ QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
 
 STRING = "load: string\nmake_up_torque_nm: 29000\ntorque_ramp_nm_s: 400\n"
 """Keys of rig.yaml for a drill string on the shaft."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldRig:
+    """Shaft and disturbances of that rig for the benches without a simulated drive; noises as standard deviations."""
+
+    inertia: float = 104.0
+    viscous: float = 8.0
+    coulomb: float = 60.0
+    torque_lag: float = 0.010        # of the motor behind its command
+    load_sd: float = 3.0             # Ornstein-Uhlenbeck load disturbance
+    load_time: float = 0.5
+    ripple_sd: float = 10.0          # motor torque, white per step
+    sensor_sd: float = 0.02          # speed sensor, white per step
+    speed_noise: float = 0.003       # of the report
+    torque_noise: float = 2.0
+    speed_quantum: float = 0.0105
+    torque_quantum: float = 1.0
 
 
 def limits_text(**changes: object) -> str:

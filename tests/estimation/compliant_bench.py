@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.recording.recording import Excitation, LagPrior, Recording, Segment
+from tests.estimation.reporting import lagged
 
 DT = 0.01                              # also of the samples
 PERIOD_S = 20.0
@@ -214,7 +215,7 @@ def run(
         target[inside] += (turned @ amplitudes).real
         feed[inside] += (turned @ (amplitudes * z)).real
     speed, torque = _turned(plant, many, rng, noise, time, mean, target, feed, dry)
-    seen_speed, seen_torque = (_lagged(x, lag) for x, lag in zip((speed, torque), lags_s, strict=True))
+    seen_speed, seen_torque = (lagged(x, (lag,), DT) for x, lag in zip((speed, torque), lags_s, strict=True))
     segments = tuple(
         Segment(start, start + length, PERIOD_S, settle, offset, lines,
                 tuple(float(a) for a in amplitudes), tuple(float(p) for p in phases))
@@ -247,18 +248,6 @@ def _turned(plant, many, rng, noise, time, mean, target, feed, dry):
         integral += pull * DT * error
     sensed = speed + noise.sensor_rad_s * np.stack([r.standard_normal(steps) for r in rng], axis=1)
     return sensed, torque
-
-
-def _lagged(x, lag_s):
-    """First order, exact for an input that is straight between steps."""
-    from scipy.signal import lfilter
-
-    if lag_s <= 0.0:
-        return x
-    keep = np.exp(-DT / lag_s)
-    late = 1.0 - (1.0 - keep) * lag_s / DT
-    early = (1.0 - keep) * lag_s / DT - keep
-    return lfilter([late, early], [1.0, -keep], x, axis=0, zi=x[:1] * (1.0 - late))[0]
 
 
 def _recorded(speed, torque, noise, segments, lag_prior):

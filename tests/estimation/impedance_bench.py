@@ -16,6 +16,7 @@ from tdhil.estimation.periodic import measured
 from tdhil.estimation.result import Options
 from tdhil.estimation.samples import usable_samples
 from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Level, Recording, Segment
+from tests.rigs import FieldRig
 
 HARMONICS = np.array([1, 2, 3, 5, 7, 10, 14, 20, 30])
 PHASES = np.array([0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651])
@@ -28,27 +29,16 @@ SETTINGS = {                       # P and I at the motor: the reference case's,
 
 
 @dataclass(frozen=True)
-class Machine:
-    """SI at the motor shaft; noises as standard deviations, white ones of a step of 2 ms."""
+class Machine(FieldRig):
+    """The rig with its speed loop; white noises are those of a step of 2 ms."""
 
     gain: float = 300.0
     integral: float = 300.0
-    inertia: float = 104.0
-    viscous: float = 8.0
-    coulomb: float = 60.0
-    torque_lag: float = 0.010
     speed_filter: float = 0.020
     reference_filter: float = 0.0
     speed_report: float = 0.40
     torque_report: float = 0.15
-    load_sd: float = 3.0
-    load_time: float = 0.5
-    ripple_sd: float = 10.0
-    sensor_sd: float = 0.02
-    speed_noise: float = 0.003
-    torque_noise: float = 2.0
     speed_quantum: float = 0.1 * np.pi / 30.0
-    torque_quantum: float = 1.0
     period: float = 0.004
     late: float = 0.0              # of the command
     torque_scale: float = 1.0      # reported torque over commanded torque

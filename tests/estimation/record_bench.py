@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tdhil.recording.recording import LagPrior, Recording
+from tests.estimation.reporting import delayed, lagged
 
 SPEED, TORQUE, OFF = 0.0, 1.0, 2.0
 
@@ -74,19 +75,12 @@ class Script:
 
 
 def filtered(x: np.ndarray, report: Report, dt: float) -> np.ndarray:
-    from scipy.signal import lfilter
-
-    for tau in report.poles:
-        a = np.exp(-dt / tau)
-        g = 1.0 - (1.0 - a) * tau / dt
-        f = (1.0 - a) * tau / dt - a
-        x, _ = lfilter([g, f], [1.0, -a], x, axis=0, zi=x[:1] * (1.0 - g))
+    x = lagged(x, report.poles, dt)
     n = round(report.average / dt)
     if n > 1:
         total = np.cumsum(np.concatenate([np.zeros_like(x[:1]), np.repeat(x[:1], n - 1, axis=0), x]), axis=0)
         x = (total[n:] - total[:-n]) / n
-    n = round(report.delay / dt)
-    return x if n == 0 else np.concatenate([np.repeat(x[:1], n, axis=0), x[:-n]])
+    return delayed(x, report.delay, dt)
 
 
 def turn(machine: Machine, script: Script, rngs: list[np.random.Generator]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,26 +11,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tdhil.recording.recording import Excitation, LagPrior, Level, Recording, Segment
+from tests.estimation.reporting import delayed, lagged
+from tests.rigs import FieldRig
 
 DT = 0.002
 
 
 @dataclass(frozen=True)
-class Rig:
-    inertia: float = 104.0
-    viscous: float = 8.0
-    coulomb: float = 60.0
+class Rig(FieldRig):
     stribeck: float = 0.0            # more friction at rest, a bell over speed of so many rad/s
     stribeck_width: float = 2.0
-    torque_lag: float = 0.010        # of the motor behind its command
-    load_sd: float = 3.0             # Ornstein-Uhlenbeck load disturbance
-    load_time: float = 0.5
-    ripple_sd: float = 10.0          # motor torque, white per step
-    sensor_sd: float = 0.02          # speed sensor, white per step
-    reported_speed_sd: float = 0.003
-    reported_torque_sd: float = 2.0
-    speed_quantum: float = 0.0105
-    torque_quantum: float = 1.0
     torque_limit: float = 400.0
     speed_poles: tuple[float, ...] = (0.40,)
     torque_poles: tuple[float, ...] = (0.15,)
@@ -52,32 +42,12 @@ class Motion:
     end_s: float = field(default=0.0)
 
 
-def filtered(x: np.ndarray, poles: tuple[float, ...]) -> np.ndarray:
-    from scipy.signal import lfilter
-
-    for tau in poles:
-        if tau > 0.0:
-            a = np.exp(-DT / tau)
-            # trapezoidal in effect: the input between two steps is taken as linear
-            g = 1.0 - (1.0 - a) * tau / DT
-            f = (1.0 - a) * tau / DT - a
-            zi = np.zeros((1, x.shape[1]))
-            zi[0] = x[0] * (1.0 - g)
-            x, _ = lfilter([g, f], [1.0, -a], x, axis=0, zi=zi)
-    return x
-
-
 def averaged(x: np.ndarray, width_s: float) -> np.ndarray:
     n = round(width_s / DT)
     if n < 2:
         return x
     total = np.cumsum(np.concatenate([np.repeat(x[:1], n, axis=0), x]), axis=0)
     return (total[n:] - total[:-n]) / n
-
-
-def delayed(x: np.ndarray, delay_s: float) -> np.ndarray:
-    n = round(delay_s / DT)
-    return x if n == 0 else np.concatenate([np.repeat(x[:1], n, axis=0), x[:-n]])
 
 
 @dataclass(frozen=True)
@@ -167,9 +137,9 @@ def recordings(
 ) -> list[Recording]:
     """What the drive reports of it, one recording per seed; fewer seeds than the shaft has take its first columns."""
     many = len(seeds)
-    seen = averaged(filtered(shaft.speed[:, :many], rig.speed_poles), rig.speed_average)
-    speed = delayed(seen, rig.speed_delay)
-    torque = delayed(filtered(shaft.torque[:, :many], rig.torque_poles), rig.torque_delay)
+    seen = averaged(lagged(shaft.speed[:, :many], rig.speed_poles, DT), rig.speed_average)
+    speed = delayed(seen, rig.speed_delay, DT)
+    torque = delayed(lagged(shaft.torque[:, :many], rig.torque_poles, DT), rig.torque_delay, DT)
     streams = [np.random.default_rng(seed + 1_000_003) for seed in seeds]
     return [
         _recorded(rig, motion, mode, k, streams[k], speed[:, k], torque[:, k], rate_hz, jitter_s, drop,
@@ -212,8 +182,8 @@ def _recorded(rig, motion, mode, k, rng, speed, torque, rate_hz, jitter_s, drop,
         index = np.unique(np.clip(index, 0, len(speed) - 1))
     seen_speed, seen_torque = speed[index], torque[index]
     if not rig.quiet:
-        seen_speed = seen_speed + rig.reported_speed_sd * rng.standard_normal(len(index))
-        seen_torque = seen_torque + rig.reported_torque_sd * rng.standard_normal(len(index))
+        seen_speed = seen_speed + rig.speed_noise * rng.standard_normal(len(index))
+        seen_torque = seen_torque + rig.torque_noise * rng.standard_normal(len(index))
         seen_speed = np.round(seen_speed / rig.speed_quantum) * rig.speed_quantum
         seen_torque = np.round(seen_torque / rig.torque_quantum) * rig.torque_quantum
     fresh = rng.random(len(index)) >= drop if drop > 0.0 else np.ones(len(index), dtype=bool)

@@ -1,0 +1,21 @@
+"""What becomes of a signal between the shaft and the report of a bench: arrays of (steps, runs), a step of ``dt``."""
+
+import numpy as np
+
+
+def lagged(x: np.ndarray, poles: tuple[float, ...], dt: float) -> np.ndarray:
+    """First-order lags in a row, exact for an input that is straight between steps, at rest before them."""
+    from scipy.signal import lfilter
+
+    for tau in poles:
+        if tau > 0.0:
+            keep = np.exp(-dt / tau)
+            late = 1.0 - (1.0 - keep) * tau / dt
+            early = (1.0 - keep) * tau / dt - keep
+            x, _ = lfilter([late, early], [1.0, -keep], x, axis=0, zi=x[:1] * (1.0 - late))
+    return x
+
+
+def delayed(x: np.ndarray, delay_s: float, dt: float) -> np.ndarray:
+    n = round(delay_s / dt)
+    return x if n == 0 else np.concatenate([np.repeat(x[:1], n, axis=0), x[:-n]])
