@@ -84,7 +84,7 @@ class TcpPeer(Peer):
 
     def run(self):
         while not self.over.is_set():
-            with contextlib.suppress(TimeoutError), contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):
                 connection, _ = self.listener.accept()
                 self.connections += 1
                 with connection:

@@ -9,10 +9,10 @@ import select
 import signal
 import socket
 import struct
-import threading
 
 import pytest
 
+from tests.drivers.modbus_peers import TcpPeer
 from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, modbus_peer, tail_time, wait_for
 from tests.rigs import PATIENT, PATIENT_S, rig_file
 
@@ -25,33 +25,16 @@ RATE_HZ = 4.0
 """Slow: in real time a busy machine must not be taken for a fault. Three cycles without feedback end a run."""
 
 
-class Relay(threading.Thread):
+class Relay(TcpPeer):
     """Passes everything on, until ``fault`` says otherwise: reset, half-open, or foreign (once)."""
 
     def __init__(self, port):
-        super().__init__(daemon=True)
-        self.fault, self.connections, self.port_behind = "", 0, port
-        self.listener = socket.create_server(("127.0.0.1", 0))
-        self.listener.settimeout(0.02)
-        self.port = self.listener.getsockname()[1]
-        self.over = threading.Event()
+        super().__init__(None)
+        self.fault, self.port_behind = "", port
 
-    def __enter__(self):
-        self.start()
-        return self
-
-    def __exit__(self, *error):
-        self.over.set()
-        self.join(5.0)
-        self.listener.close()
-
-    def run(self):
-        while not self.over.is_set():
-            with contextlib.suppress(OSError):
-                host, _ = self.listener.accept()
-                self.connections += 1
-                with host, socket.create_connection(("127.0.0.1", self.port_behind)) as drive:
-                    self.carry(host, drive)
+    def serve(self, connection):
+        with socket.create_connection(("127.0.0.1", self.port_behind)) as drive:
+            self.carry(connection, drive)
 
     def carry(self, host, drive):
         while not self.over.is_set():

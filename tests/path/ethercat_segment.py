@@ -62,4 +62,4 @@ def simulated_drive(folder, *arguments):
     ) as child:
         ready = child.stdout.readline()
         assert ready.startswith("ready: "), ready
-        yield Peer(("-i", ours, "--position", "0"), trace, child)
+        yield Peer(trace, ("-i", ours, "--position", "0"), child)

@@ -226,12 +226,10 @@ def process(*command: object, **options: Any) -> Iterator[subprocess.Popen]:
 
 
 @dataclass
-class Peer:
-    """A simulated drive in a process of its own, and how it is reached."""
+class Traced:
+    """A simulated drive that writes a trace of its shaft."""
 
-    options: tuple[str, ...]
     trace: Path
-    child: subprocess.Popen
 
     @cached_property
     def _follower(self) -> ShaftTrace:
@@ -241,6 +239,14 @@ class Peer:
     def shaft(self) -> Shaft:
         """What the shaft has done so far."""
         return self._follower.read()
+
+
+@dataclass
+class Peer(Traced):
+    """A simulated drive in a process of its own, and how it is reached."""
+
+    options: tuple[str, ...]
+    child: subprocess.Popen
 
     @property
     def port(self) -> str:
@@ -268,7 +274,7 @@ def peer(folder: Path, *arguments: object, program: tuple[object, ...] = PATIENT
                        "tcp_tune=True")
         else:
             options = tuple(str(argument) for argument in arguments[:4])     # -i … -c …
-        yield Peer(options, trace, child)
+        yield Peer(trace, options, child)
 
 
 @contextlib.contextmanager
@@ -279,7 +285,7 @@ def modbus_peer(trace: Path, *arguments: object, program: tuple[object, ...] = P
         assert child.stdout is not None
         found = re.search(r"127\.0\.0\.1:(\d+)", child.stdout.readline())
         assert found
-        yield Peer(("--host", "127.0.0.1", "--port", found.group(1)), trace, child)
+        yield Peer(trace, ("--host", "127.0.0.1", "--port", found.group(1)), child)
 
 
 @dataclass

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
-from sim_bus.inverter import RPM, Inverter
+from drivers.drive import Command, Mode, PowerState, Sample
+from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest, StopRequest
@@ -17,13 +17,13 @@ from tdhil.runner.task import Task
 from tdhil.session.conclusion import conclude
 from tests import rigs
 from tests.runner.fake_drive import FakeDisplay
-from tests.runner.line_drive import BuilderLog
+from tests.runner.line_drive import BuilderLog, OverInverter
 
 TRUE_KG_M2 = 104.0
 LIMITS = replace(rigs.LIMITS, time_s=3600.0)
 
 
-class InverterDrive:
+class InverterDrive(OverInverter):
     """The simulated inverter as a drive, without a bus, one exchange a cycle.
 
     The command acts, the plant moves on by a cycle, the reports are read.
@@ -31,50 +31,20 @@ class InverterDrive:
 
     def __init__(self, params: RigParams, seed: int, rate_hz: float = 100.0) -> None:
         self.clock, self.period_s = SteppedClock(), 1.0 / rate_hz
-        self.inverter = Inverter(params, np.random.default_rng(seed))
+        self.params, self.inverter = params, Inverter(params, np.random.default_rng(seed))
         self._steps = self.inverter.steps(self.period_s)
-        self._state = self._wish = PowerState.OFF
-        self._mode, self._cycles, self._stop_rad_s2 = Mode.SPEED, 0, 2.0
-
-    @property
-    def counters(self) -> Counters:
-        return Counters(self._cycles)
-
-    def connect(self) -> Identity:
-        return Identity(0, 0, 0, 0, "inverter", True)
-
-    def preflight(self, limits: DriveLimits) -> Preflight:
-        params, self._stop_rad_s2 = self.inverter.params, limits.quick_stop_rad_s2
-        return Preflight(
-            identity=self.connect(), checks=(), modes=frozenset(Mode), switch_while_enabled=True,
-            quick_stop_in_torque_mode=True, rated_torque_nm=params.drive.rated_torque_nm,
-            torque_resolution_nm=params.reporting.torque_quantum_permille * params.drive.rated_torque_nm / 1000.0,
-            speed_resolution_rad_s=params.reporting.speed_quantum_rpm * RPM, watchdog_s=limits.watchdog_s,
-            safe_action="quick_stop",
-        )
-
-    def reset_fault(self) -> None:
-        """It never is in fault."""
-
-    def enable(self, mode: Mode) -> None:
-        self._wish, self._mode = PowerState.ENABLED, mode
+        self._state, self._mode = PowerState.OFF, Mode.SPEED
 
     def quick_stop(self) -> None:
         self._wish = PowerState.QUICK_STOP
 
-    def disable(self) -> None:
-        self._wish = PowerState.OFF
-
-    def close(self) -> tuple[str, ...]:
-        return ()
-
     def exchange(self, command: Command) -> Sample:
         self.clock.wait_until(self.clock.now_s() + self.period_s)
-        self._cycles += 1
+        self.cycles += 1
         self._state, self._mode = self._wish, command.mode
         control = self.inverter.control
         if self._state is PowerState.QUICK_STOP:
-            control.stop(self._stop_rad_s2)
+            control.stop(self._limits.quick_stop_rad_s2)
         elif self._state is PowerState.OFF:
             control.off()
         elif command.mode is Mode.TORQUE:

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
-from sim_bus.inverter import Inverter, Regulation
+from sim_bus.inverter import RPM, Inverter, Regulation
 from sim_bus.params import DriveParams, RigParams
 from tdhil.recording.builder import RecordingBuilder, RecordingPart
 from tdhil.recording.log_format import LiveInertia
@@ -42,9 +42,51 @@ class Line:
     apart: bool = False
 
 
+class OverInverter:
+    """What the drives over `sim_bus.inverter` have in common of the Drive contract."""
+
+    params: RigParams
+    modes: frozenset[Mode] = frozenset(Mode)
+    cycles: int = 0
+
+    _wish = PowerState.OFF
+    _limits = DRIVE_LIMITS
+
+    @property
+    def counters(self) -> Counters:
+        return Counters(self.cycles)
+
+    def connect(self) -> Identity:
+        return Identity(1, 2, 3, 4, "inverter", True)
+
+    def preflight(self, limits: DriveLimits) -> Preflight:
+        self._limits = limits
+        reporting, rated_nm = self.params.reporting, self.params.drive.rated_torque_nm
+        return Preflight(
+            identity=self.connect(), checks=(), modes=self.modes, switch_while_enabled=True,
+            quick_stop_in_torque_mode=True, rated_torque_nm=rated_nm,
+            torque_resolution_nm=1e-3 * reporting.torque_quantum_permille * rated_nm,
+            speed_resolution_rad_s=reporting.speed_quantum_rpm * RPM, watchdog_s=limits.watchdog_s,
+            safe_action="quick_stop",
+            torque_offset_resolution_nm=1.0 if limits.torque_offset else 0.0,
+        )
+
+    def reset_fault(self) -> None:
+        """It never is in fault."""
+
+    def enable(self, mode: Mode) -> None:
+        self._wish = PowerState.ENABLED
+
+    def disable(self) -> None:
+        self._wish = PowerState.OFF
+
+    def close(self) -> tuple[str, ...]:
+        return ()
+
+
 @dataclass
-class LineDrive:
-    """The Drive contract, in a few lines, over `sim_bus.inverter`."""
+class LineDrive(OverInverter):
+    """A drive on a slow line."""
 
     line: Line
     params: RigParams = COARSE
@@ -65,8 +107,7 @@ class LineDrive:
         self._line_rng = np.random.default_rng([self.seed, 1])
         self._plant_s = 0.0
         self._slot_s = 0.0
-        self._state = self._wish = PowerState.OFF
-        self._limits = DRIVE_LIMITS
+        self._state = PowerState.OFF
         self._mode: Mode = Mode.SPEED
 
     @property
@@ -75,40 +116,13 @@ class LineDrive:
         assert self.ready, "the period was read before preflight had measured it"
         return self.line.period_s
 
-    @property
-    def counters(self) -> Counters:
-        return Counters(self.cycles)
-
-    def connect(self) -> Identity:
-        return Identity(1, 2, 3, 4, "line", True)
-
     def preflight(self, limits: DriveLimits) -> Preflight:
-        self._limits, self.ready = limits, True
-        reporting = self.params.reporting
-        return Preflight(
-            identity=self.connect(), checks=(), modes=self.modes, switch_while_enabled=True,
-            quick_stop_in_torque_mode=True, rated_torque_nm=self.params.drive.rated_torque_nm,
-            torque_resolution_nm=1e-3 * reporting.torque_quantum_permille * self.params.drive.rated_torque_nm,
-            speed_resolution_rad_s=reporting.speed_quantum_rpm * np.pi / 30.0, watchdog_s=limits.watchdog_s,
-            safe_action="quick_stop",
-            torque_offset_resolution_nm=1.0 if limits.torque_offset else 0.0,
-        )
-
-    def reset_fault(self) -> None:
-        pass
-
-    def enable(self, mode: Mode) -> None:
-        self._wish = PowerState.ENABLED
+        self.ready = True
+        return super().preflight(limits)
 
     def quick_stop(self) -> None:
         if self._state is PowerState.ENABLED:
             self._wish = PowerState.QUICK_STOP
-
-    def disable(self) -> None:
-        self._wish = PowerState.OFF
-
-    def close(self) -> tuple[str, ...]:
-        return ()
 
     def exchange(self, command: Command) -> Sample:
         line, rng = self.line, self._line_rng

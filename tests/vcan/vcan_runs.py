@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import can
@@ -25,7 +24,7 @@ from tests.path.path_runs import (
     TORQUE_NM,
     Finished,
     Shaft,
-    ShaftTrace,
+    Traced,
     identify,
     wait_for,
 )
@@ -50,19 +49,10 @@ def run(*command: object) -> None:
 
 
 @dataclass
-class Drive:
+class Drive(Traced):
     """A simulated drive in a thread of the test."""
 
     simulator: Simulator
-    trace: Path
-
-    @cached_property
-    def _follower(self) -> ShaftTrace:
-        return ShaftTrace(self.trace)
-
-    @property
-    def shaft(self) -> Shaft:
-        return self._follower.read()
 
     def rests(self) -> bool:
         """It has been brought to rest, and has stood for more than a second of plant time."""
@@ -80,7 +70,7 @@ def simulated(folder: Path, interface: str, *, stepped: bool = True) -> Iterator
         thread.start()
         try:
             wait_for("its boot-up", lambda: trace.exists() and b"power on" in trace.read_bytes())
-            yield Drive(simulator, trace)
+            yield Drive(trace, simulator)
         finally:
             ended.set()
             thread.join()
