@@ -11,9 +11,10 @@ from tdhil.calibration import CountedTurns, calibrate_by_position, calibrate_by_
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.estimation import AngleRatio, mean_speed
-from tdhil.recording import Level, Recording
+from tdhil.recording import Level
 from tdhil.session import RunRecord, TurnsCount, add_speed_calibration, speed_by_position, speed_by_turns
 from tests.calibration.bodies import IDENTITY
+from tests.estimation.reporting import recorded
 
 SCALE = 1.03
 """Reported over true speed."""
@@ -32,9 +33,8 @@ def turning(seconds=120.0, lag=0.3, resolution=1e-3, scale=SCALE, position=True,
     if last is not None:
         speed = np.where(time > seconds / 2.0, last / scale * speed, speed)
     count = 2.0 * math.pi / 4096.0
-    plain = np.zeros(len(time), dtype=bool)
-    return Recording(
-        time, speed, np.full(len(time), 90.0) + 0.01 * np.arange(len(time)) % 7, ~plain, plain,
+    return recorded(
+        time, speed, np.full(len(time), 90.0) + 0.01 * np.arange(len(time)) % 7,
         levels=(Level(0.0, seconds / 2.0), Level(seconds / 2.0, seconds)), speed_resolution_rad_s=resolution,
         position_rad=count * np.round(angle / count) if position else None, simulated=True, gear_ratio=4.0)
 

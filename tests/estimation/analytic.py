@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from tdhil.recording.recording import Excitation, LagPrior, Recording, Segment
+from tdhil.recording.recording import Excitation, LagPrior, Segment
+from tests.estimation.reporting import recorded
 
 LINES = (0.1, 0.2, 0.3, 0.4)
 
@@ -54,13 +55,8 @@ def closed_form(
         )
         begin += periods * period + unrecorded_s
     time = np.concatenate(times)
-    count = len(time)
-    return Recording(
-        time_s=time,
-        speed_rad_s=np.concatenate(speeds),
-        torque_nm=np.concatenate(torques) + noise * rng.standard_normal(count),
-        fresh=np.ones(count, dtype=bool),
-        limited=np.zeros(count, dtype=bool),
+    return recorded(
+        time, np.concatenate(speeds), np.concatenate(torques) + noise * rng.standard_normal(len(time)),
         excitation=Excitation("multisine" if len(lines) > 1 else "sine", "torque", tuple(segments)),
         lag_prior=lag_prior or LagPrior(),
         torque_limit_nm=1000.0,

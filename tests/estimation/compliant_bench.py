@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.recording.recording import Excitation, LagPrior, Recording, Segment
-from tests.estimation.reporting import lagged
+from tests.estimation.reporting import lagged, recorded
 
 DT = 0.01                              # also of the samples
 PERIOD_S = 20.0
@@ -254,13 +254,8 @@ def _recorded(speed, torque, noise, segments, lag_prior):
     if noise.quantum_rad_s > 0.0:
         speed = np.round(speed / noise.quantum_rad_s) * noise.quantum_rad_s
         torque = np.round(torque / noise.quantum_nm) * noise.quantum_nm
-    count = len(speed)
-    return Recording(
-        time_s=np.arange(count) * DT,
-        speed_rad_s=np.ascontiguousarray(speed),
-        torque_nm=np.ascontiguousarray(torque),
-        fresh=np.ones(count, dtype=bool),
-        limited=np.zeros(count, dtype=bool),
+    return recorded(
+        np.arange(len(speed)) * DT, np.ascontiguousarray(speed), np.ascontiguousarray(torque),
         excitation=Excitation("multisine", "torque", segments),
         lag_prior=lag_prior,
         speed_resolution_rad_s=noise.quantum_rad_s,

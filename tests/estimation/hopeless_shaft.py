@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tdhil.recording.recording import Excitation, Recording, Segment
+from tests.estimation.reporting import recorded
 
 INERTIA, VISCOUS, COULOMB = 104.0, 8.0, 60.0
 DT = 0.01
@@ -131,12 +132,8 @@ def _recorded(trouble: Trouble, speed: np.ndarray, torque: np.ndarray, rng: np.r
     if not trouble.quiet:
         seen_speed = np.round((seen_speed + 0.005 * rng.standard_normal(len(time))) / steps[0]) * steps[0]
         seen_torque = np.round((seen_torque + 1.0 * rng.standard_normal(len(time))) / steps[1]) * steps[1]
-    return Recording(
-        time_s=time,
-        speed_rad_s=seen_speed,
-        torque_nm=seen_torque,
-        fresh=np.ones(len(time), dtype=bool),
-        limited=np.zeros(len(time), dtype=bool),
+    return recorded(
+        time, seen_speed, seen_torque,
         excitation=Excitation("multisine", "torque", sound_segments(trouble)),
         speed_resolution_rad_s=steps[0],
         torque_resolution_nm=steps[1],

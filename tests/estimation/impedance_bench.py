@@ -15,7 +15,8 @@ from tdhil.estimation.impedance import measure_impedance
 from tdhil.estimation.periodic import measured
 from tdhil.estimation.result import Options
 from tdhil.estimation.samples import usable_samples
-from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Level, Recording, Segment
+from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Level, Segment
+from tests.estimation.reporting import recorded
 from tests.rigs import FieldRig
 
 HARMONICS = np.array([1, 2, 3, 5, 7, 10, 14, 20, 30])
@@ -151,10 +152,9 @@ def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, s
         tuple(sizes) if by == "reference" else (0.0,) * len(sizes), tuple(phases),
         tuple(sizes) if by == "offset" else (),
     )
-    return Recording(
-        time_s=time, speed_rad_s=np.round(speed / machine.speed_quantum) * machine.speed_quantum,
-        torque_nm=np.round(torque / machine.torque_quantum) * machine.torque_quantum,
-        fresh=np.ones(total, dtype=bool), limited=np.zeros(total, dtype=bool),
+    return recorded(
+        time, np.round(speed / machine.speed_quantum) * machine.speed_quantum,
+        np.round(torque / machine.torque_quantum) * machine.torque_quantum,
         excitation=Excitation("multisine", "speed", (segment,)),
         levels=(Level(0.0, LEVEL_S - h), Level(40.0, 40.0 + LEVEL_S - h)), lag_prior=prior or LagPrior(),
         speed_resolution_rad_s=machine.speed_quantum, torque_resolution_nm=machine.torque_quantum,

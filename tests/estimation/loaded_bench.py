@@ -11,7 +11,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from tdhil.estimation import torque_answer
-from tdhil.recording import Excitation, LagPrior, Pipe, Recording, Segment
+from tdhil.recording import Excitation, LagPrior, Pipe, Segment
+from tests.estimation.reporting import recorded
 
 STEP_S = 0.02
 SECTION_STEPS = 4
@@ -107,12 +108,10 @@ def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2
     for lag_s in plant.torque_lags_s:
         acted = late(acted, lag_s)
     segment = Segment(0.0, (settle + periods) * period_s, period_s, settle, plant.mean_rad_s, tuple(lines_hz), (), ())
-    every, none = np.ones(len(time), dtype=bool), np.zeros(len(time), dtype=bool)
     found = [
-        Recording(
-            time_s=time, fresh=every, limited=none,
-            speed_rad_s=speeds[:, run] + plant.speed_noise_rad_s * stream.standard_normal(len(time)),
-            torque_nm=acted[:, run] + plant.torque_noise_nm * stream.standard_normal(len(time)),
+        recorded(
+            time, speeds[:, run] + plant.speed_noise_rad_s * stream.standard_normal(len(time)),
+            acted[:, run] + plant.torque_noise_nm * stream.standard_normal(len(time)),
             excitation=Excitation("prbs", "torque", (segment,)), torque_limit_nm=15000.0, simulated=True,
             lag_prior=lag_prior or LagPrior(), pipe=plant.pipe(0.03 * float(stream.standard_normal())),
         )

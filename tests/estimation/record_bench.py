@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tdhil.recording.recording import LagPrior, Recording
-from tests.estimation.reporting import delayed, lagged
+from tests.estimation.reporting import delayed, lagged, recorded
 
 SPEED, TORQUE, OFF = 0.0, 1.0, 2.0
 
@@ -167,10 +167,9 @@ def report(
         q_w, q_t = m.speed_quantum * reading.coarse, m.torque_quantum * reading.coarse
         w, t = np.round(w / q_w) * q_w, np.round(t / q_t) * q_t
         stamps = np.sort(at + rng.uniform(-reading.stamp_error_s, reading.stamp_error_s, len(at)))
-        found.append(Recording(
-            time_s=stamps, speed_rad_s=w, torque_nm=t, fresh=np.ones(len(at), dtype=bool),
-            limited=np.zeros(len(at), dtype=bool), lag_prior=prior or LagPrior(),
-            speed_resolution_rad_s=q_w, torque_resolution_nm=q_t, simulated=True,
+        found.append(recorded(
+            stamps, w, t, lag_prior=prior or LagPrior(), speed_resolution_rad_s=q_w, torque_resolution_nm=q_t,
+            simulated=True,
         ))
     return found
 

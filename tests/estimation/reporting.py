@@ -1,6 +1,8 @@
-"""What becomes of a signal between the shaft and the report of a bench: arrays of (steps, runs), a step of ``dt``."""
+"""What a bench reports of its shaft: signals of (steps, runs) at a step of ``dt``, and the recording of a run."""
 
 import numpy as np
+
+from tdhil.recording.recording import Recording
 
 
 def lagged(x: np.ndarray, poles: tuple[float, ...], dt: float) -> np.ndarray:
@@ -19,3 +21,9 @@ def lagged(x: np.ndarray, poles: tuple[float, ...], dt: float) -> np.ndarray:
 def delayed(x: np.ndarray, delay_s: float, dt: float) -> np.ndarray:
     n = round(delay_s / dt)
     return x if n == 0 else np.concatenate([np.repeat(x[:1], n, axis=0), x[:-n]])
+
+
+def recorded(time_s: np.ndarray, speed_rad_s: np.ndarray, torque_nm: np.ndarray, **facts: object) -> Recording:
+    """A recording of which every sample is fresh and none is limited, unless ``facts`` say so."""
+    every = np.ones(len(time_s), dtype=bool)
+    return Recording(time_s, speed_rad_s, torque_nm, **{"fresh": every, "limited": ~every, **facts})

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tdhil.recording.recording import Excitation, LagPrior, Level, Recording, Segment
-from tests.estimation.reporting import delayed, lagged
+from tests.estimation.reporting import delayed, lagged, recorded
 from tests.rigs import FieldRig
 
 DT = 0.002
@@ -190,12 +190,9 @@ def _recorded(rig, motion, mode, k, rng, speed, torque, rate_hz, jitter_s, drop,
     for i in np.flatnonzero(~fresh):     # a stale sample repeats what was there before
         if i > 0:
             seen_speed[i], seen_torque[i] = seen_speed[i - 1], seen_torque[i - 1]
-    return Recording(
-        time_s=index * DT,
-        speed_rad_s=seen_speed,
-        torque_nm=seen_torque,
+    return recorded(
+        index * DT, seen_speed, seen_torque,
         fresh=fresh,
-        limited=np.zeros(len(index), dtype=bool),
         excitation=Excitation(motion.kind, mode, motion.segments),
         levels=motion.levels,
         lag_prior=lag_prior,

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from tdhil.recording.recording import Recording
+from tests.estimation.reporting import recorded
 
 INERTIAS_KG_M2 = (0.02, 0.1, 0.35, 1.0, 4.0, 15.0, 50.0, 104.0, 500.0)
 SEEDS_EACH = 12                # 108 records in all
@@ -110,8 +111,7 @@ def _reported(shaft: StickSlip, rng: np.random.Generator, speed: np.ndarray, tor
     q_w, q_t = 0.002 * float(np.max(np.abs(speed))), 0.002 * float(np.max(np.abs(torque)))
     speed = speed + q_w * 0.5 * rng.standard_normal(len(speed))
     torque = torque + 2.0 * q_t * rng.standard_normal(len(torque))
-    flags = np.ones(len(speed), dtype=bool)
-    return Recording(
-        np.arange(len(speed)) * each * dt, np.round(speed / q_w) * q_w, np.round(torque / q_t) * q_t, flags, ~flags,
+    return recorded(
+        np.arange(len(speed)) * each * dt, np.round(speed / q_w) * q_w, np.round(torque / q_t) * q_t,
         speed_resolution_rad_s=q_w, torque_resolution_nm=q_t,
     )

@@ -12,8 +12,9 @@ from tdhil.estimation.frequency_domain.inference import standard_deviation
 from tdhil.estimation.frequency_domain.optimiser import box, minimise
 from tdhil.estimation.result import Refused
 from tdhil.estimation.spectrum import PeriodLines, SpectralLine, pooled_lines
-from tdhil.recording import Excitation, LagPrior, Recording, Segment
+from tdhil.recording import Excitation, LagPrior, Segment
 from tests.estimation.loaded_bench import STEP_S, Loaded, late, records, turned
+from tests.estimation.reporting import recorded
 
 PLANT = Loaded(bit_noise_nm=200.0)
 PERIOD_S, COUNT = 20.0, 20
@@ -139,10 +140,9 @@ def answering(filtered, own_lag_s=0.01, length=None):
     time = STEP_S * np.arange(round(6 * PERIOD_S / STEP_S))
     commanded = (np.exp(2j * np.pi * np.outer(time, LINES_HZ)) @ TORQUES).real
     commanded += 100.0 * lfilter([0.1], [1.0, -0.9], np.random.default_rng(4).standard_normal(len(time)))
-    every, none = np.ones(len(time), dtype=bool), np.zeros(len(time), dtype=bool)
     segment = Segment(0.0, 6 * PERIOD_S, PERIOD_S, 2, 20.0, LINES_HZ, (), ())
-    one = Recording(time, 20.0 + 0.0 * time, filtered(late(commanded, own_lag_s)), every, none,
-                    excitation=Excitation("prbs", "torque", (segment,)))
+    one = recorded(time, 20.0 + 0.0 * time, filtered(late(commanded, own_lag_s)),
+                   excitation=Excitation("prbs", "torque", (segment,)))
     return torque_answer(one, commanded[:length])
 
 

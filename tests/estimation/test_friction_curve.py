@@ -13,7 +13,7 @@ from tdhil.estimation.cross_checks.momentum_fit import Delay
 from tdhil.estimation.friction_levels import Levels, measure_levels
 from tdhil.estimation.samples import stretches, usable_samples
 from tdhil.estimation.spectrum import period_lines
-from tdhil.recording.recording import Recording
+from tests.estimation.reporting import recorded
 from tests.estimation.stages_bench import usual_runs
 
 pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
@@ -35,9 +35,7 @@ def held(plant, seed, speeds=SPEEDS, hold_s=14.0):
                 inverter.step(step)
             now += 0.01
             rows.append((now, inverter.reporting.speed_rad_s, inverter.reporting.torque_nm))
-    table = np.array(rows)
-    flags = np.ones(len(table), dtype=bool)
-    return Recording(*(table[:, k].copy() for k in range(3)), flags, ~flags)
+    return recorded(*np.array(rows).T.copy())
 
 
 def curve_of(recording, density=9.0, dof=18.0):

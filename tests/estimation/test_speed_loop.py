@@ -7,7 +7,8 @@ import pytest
 
 from tdhil.estimation.cross_checks.speed_loop import speed_loop
 from tdhil.estimation.samples import usable_samples
-from tdhil.recording.recording import Level, Ramp, Recording, Stage
+from tdhil.recording.recording import Level, Ramp, Stage
+from tests.estimation.reporting import recorded
 
 FINE_S = 0.001
 LOW, HIGH, RATE = 2.9, 7.2, 1.2
@@ -33,10 +34,9 @@ def ramped(gain=300.0, integral=300.0, rate_hz=15.0, speed_lag_s=0.0, setpoint_l
         if n % each == 30:
             rows.append((n * FINE_S, told + 0.003 * rng.standard_normal(), torque + 3.0 * rng.standard_normal()))
     time, seen, given = np.array(rows).T
-    fine = np.ones(len(time), dtype=bool)
     ends = time[first] + 0.001, time[time >= RAMP_S[1]][0]
-    return Recording(
-        time, seen, given, fine, ~fine, levels=(Level(0.0, ends[0]), Level(ends[1], END_S)), ramps=(Ramp(*ends),),
+    return recorded(
+        time, seen, given, levels=(Level(0.0, ends[0]), Level(ends[1], END_S)), ramps=(Ramp(*ends),),
         stages=(Stage("speed", 0.0, END_S, "ok"),),
     )
 

@@ -18,7 +18,8 @@ from tdhil.estimation import (
     Verdict,
 )
 from tdhil.estimation.result import LinePoint
-from tdhil.recording.recording import Excitation, Level, Recording, Segment, Stage
+from tdhil.recording.recording import Excitation, Level, Segment, Stage
+from tests.estimation.reporting import recorded
 
 RUN = {
     "tdhil": "0.1.0", "started": "2026-03-04T05:06:07+01:00", "operator": "A. <Person>", "note": "after\x1b[31m repair",
@@ -102,5 +103,4 @@ def recording(samples=4000, **changes):
         "torque_scale_rel_sd": 0.02,
         "simulated": True,
     } | changes
-    flags = np.ones(samples, dtype=bool)
-    return Recording(time, speed, torque, flags, ~flags, **facts)
+    return recorded(time, speed, torque, **facts)

@@ -7,8 +7,9 @@ import pytest
 
 from tdhil.estimation import identify
 from tdhil.estimation.result import Verdict
-from tdhil.recording.recording import Excitation, Recording, Segment
+from tdhil.recording.recording import Excitation, Segment
 from tdhil.studies.field.slopes import expected_slope, joined, slope_of
+from tests.estimation.reporting import recorded
 
 INERTIA, VISCOUS, COULOMB, SPEED_LAG, TORQUE_LAG = 104.0, 8.0, 60.0, 0.40, 0.15
 
@@ -23,12 +24,9 @@ def record(hertz, offset_rad_s, *, seed=0, torque_offset_nm=0.0, start_s=7.0, am
     torque = VISCOUS * offset_rad_s + COULOMB + (
         (INERTIA * s + VISCOUS) * amplitude * turn / (1.0 + TORQUE_LAG * s)).real
     count = len(time)
-    return Recording(
-        time_s=time,
-        speed_rad_s=speed + 0.003 * rng.standard_normal(count),
-        torque_nm=torque + torque_offset_nm + 2.0 * rng.standard_normal(count),
-        fresh=np.ones(count, dtype=np.bool_),
-        limited=np.zeros(count, dtype=np.bool_),
+    return recorded(
+        time, speed + 0.003 * rng.standard_normal(count),
+        torque + torque_offset_nm + 2.0 * rng.standard_normal(count),
         excitation=Excitation("sine", "speed", (
             Segment(
                 start_s, start_s + 80.0, 1.0 / hertz, round(10 * hertz), offset_rad_s, (hertz,), (amplitude,), (0.0,)
