@@ -15,6 +15,14 @@ from tests.drivers.drive_benches import LIMITS, RPM
 from tests.rigs import QUIET_RIG
 
 
+def driven(simulated, profile, clock=None):
+    """ModbusDrive on a simulated drive. It is told what no register of the profile tells."""
+    return ModbusDrive(
+        EmbeddedLink(simulated.serve, clock or SteppedClock()), profile, unit=simulated.unit,
+        given=dict(simulated.untold), rated_torque_nm=None if profile.rated_torque else simulated.rated_torque_nm,
+    )
+
+
 class ModbusBench:
     """See `drive_benches` for what a bench offers."""
 

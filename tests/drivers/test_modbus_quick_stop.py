@@ -2,12 +2,12 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode, PowerState
-from drivers.modbus.drive import ModbusDrive
+from drivers.drive import Command, Mode, PowerState
 from drivers.modbus.link import EmbeddedLink
 from drivers.modbus.quick_stop import ModbusTarget
 from drivers.quick_stop import Ended, bare_stop
@@ -16,9 +16,11 @@ from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 from tests.drivers.modbus_bank import CONTROL, MODE, MODE_SHOWN, SPEED_SETPOINT, STATUS, Bank
+from tests.drivers.modbus_bench import driven
 from tests.drivers.power_machine import ENABLED, STOPPING
+from tests.rigs import DRIVE_LIMITS
 
-LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
+LIMITS = replace(DRIVE_LIMITS, watchdog_s=1.0)
 MODBUS = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
 FAST_RAD_S = 4.0
 
@@ -32,10 +34,7 @@ class Left:
         self.simulated = EmbeddedModbusDrive(RigParams(), profile, trace=self.trace)
         self.profile = profile
         self.link = EmbeddedLink(self.simulated.serve, self.clock)
-        drive = ModbusDrive(
-            self.link, profile, unit=1, given=dict(self.simulated.untold),
-            rated_torque_nm=None if profile.rated_torque else self.simulated.rated_torque_nm,
-        )
+        drive = driven(self.simulated, profile, self.clock)
         drive.connect()
         assert not drive.preflight(LIMITS).refused
         drive.enable(Mode.SPEED)

@@ -6,16 +6,14 @@ ships, and the driver reads one with a mistake in it.
 
 import pytest
 
-from drivers.clock import SteppedClock
 from drivers.drive import DriveLimits
 from drivers.errors import PreflightRefused
-from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.wrong_maps import parse
 from sim_bus.params import RigParams
+from tests.drivers.modbus_bench import driven
 
 LIMITS = DriveLimits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5,
@@ -34,10 +32,7 @@ SHOWN = [(name, echo.setpoint) for name in profile_names()
 
 def refused(*wrongs, worn=PROFILE, read=PROFILE):
     simulated = EmbeddedModbusDrive(RigParams(), worn, wrongs=tuple(map(parse, wrongs)))
-    drive = ModbusDrive(
-        EmbeddedLink(simulated.serve, SteppedClock()), read, unit=1, given=dict(simulated.untold),
-        rated_torque_nm=None if worn.rated_torque else simulated.rated_torque_nm,
-    )
+    drive = driven(simulated, read)
     try:
         drive.connect()
         found = drive.preflight(LIMITS)
@@ -95,7 +90,7 @@ def test_an_echo_too_coarse_for_the_limits_says_so(speed_rad_s, coarse):
     profile = load_modbus_profile("danfoss/fc302")
     simulated = EmbeddedModbusDrive(RigParams(), profile)
     simulated.machine.parameters.put("maximum_reference", 10_000.0)
-    drive = ModbusDrive(EmbeddedLink(simulated.serve, SteppedClock()), profile, unit=1, rated_torque_nm=1000.0)
+    drive = driven(simulated, profile)
     drive.connect()
     limits = DriveLimits(speed_rad_s=speed_rad_s, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
     notes = [check.name for check in drive.preflight(limits).checks if "too coarse" in check.found]

@@ -1,6 +1,7 @@
 """A status word that is no state: zeros, ones, a pattern that nobody defined. Nothing is disabled on it."""
 
 import struct
+from dataclasses import replace
 
 import pytest
 
@@ -8,7 +9,7 @@ from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.quick_stop import CanopenTarget
 from drivers.cia402.state_machine import State, decode, decode_after
 from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode, PowerState
+from drivers.drive import Command, Mode, PowerState
 from drivers.errors import DriveFault
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
@@ -22,12 +23,13 @@ from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL, SPEED, STATUS, Bank
+from tests.drivers.modbus_bench import driven
 from tests.drivers.on_wire import LIMITS, cycles, prepared
 from tests.drivers.power_machine import ENABLED, STOPPING
 from tests.drivers.scripted_drive import TPDO1
 from tests.drivers.test_modbus_drive import GENERIC
 from tests.drivers.test_modbus_drive import Run as BankRun
-from tests.rigs import QUIET_RIG
+from tests.rigs import DRIVE_LIMITS, QUIET_RIG
 
 MODBUS = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
 DEAD = (b"\0" * 8, b"\xff" * 8)
@@ -134,13 +136,9 @@ def test_of_every_family_ones_are_no_state_and_zeros_none_after_it_was_enabled(p
 def test_a_good_run_of_every_family_shows_a_valid_state_in_every_cycle(profile):
     """The simulated drive speaks as its family's manual has it, not as the profile does."""
     simulated = EmbeddedModbusDrive(QUIET_RIG, profile)
-    drive = ModbusDrive(
-        EmbeddedLink(simulated.serve, SteppedClock()), profile, unit=1, given=dict(simulated.untold),
-        rated_torque_nm=None if profile.rated_torque else simulated.rated_torque_nm,
-    )
+    drive = driven(simulated, profile)
     drive.connect()
-    limits = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
-    assert not drive.preflight(limits).refused
+    assert not drive.preflight(replace(DRIVE_LIMITS, watchdog_s=1.0)).refused
     states = []
 
     def go(seconds, speed=0.0):

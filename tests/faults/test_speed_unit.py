@@ -14,8 +14,6 @@ import pytest
 from drivers.canopen.drive import CanopenDrive
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, PreflightRefused
-from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_canopen_profile, load_modbus_profile
 from sim_bus.canopen.inline import InlineSimulator
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
@@ -25,6 +23,7 @@ from tdhil.runner import speed_check
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.task import Task
+from tests.drivers.modbus_bench import driven
 from tests.rigs import LIMITS
 from tests.runner.fake_drive import FakeDisplay, FakeLog
 
@@ -161,14 +160,12 @@ def modbus(tmp_path, factor, *changes):
         ("    set_to: speed_limit_reverse\n", ""),
     )
     simulated = EmbeddedModbusDrive(RigParams(), load_modbus_profile("generic/modbus"), seed=3)
-    clock = SteppedClock()
     profile = profile_of(tmp_path, "generic/modbus", load_modbus_profile, *wrong, *changes)
 
     def true_speed():
         return simulated.speed_rad_s
 
-    drive = ModbusDrive(EmbeddedLink(simulated.serve, clock), profile, unit=1)
-    return Rig(drive, true_speed, simulated.close)
+    return Rig(driven(simulated, profile), true_speed, simulated.close)
 
 
 SPEED = "speed:\n  rpm_per_lsb"

@@ -116,14 +116,11 @@ def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_p
 
 @pytest.mark.parametrize("name", some_always((name,) for name in NAMES))
 def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
-    from drivers.clock import SteppedClock
-    from drivers.modbus.drive import ModbusDrive
-    from drivers.modbus.link import EmbeddedLink
+    from tests.drivers.modbus_bench import driven
 
     profile = load_modbus_profile(name)
     peer = embedded.EmbeddedModbusDrive(embedded.RigParams(), profile)
-    drive = ModbusDrive(EmbeddedLink(peer.serve, SteppedClock()), profile, unit=peer.unit, given=dict(peer.untold),
-                        rated_torque_nm=None if profile.rated_torque else peer.rated_torque_nm)
+    drive = driven(peer, profile)
     drive.connect()
     found = drive.preflight(DRIVE_LIMITS)
     assert found.refused == ()
