@@ -58,7 +58,7 @@ def limits_text(**changes: object) -> str:
 
 PATIENT_S = 5.0
 """Watchdog time for real time on a busy computer: a loop may pause for half of it."""
-PATIENT = limits_text(watchdog_s=PATIENT_S)
+PATIENT_LIMITS = limits_text(watchdog_s=PATIENT_S)
 
 
 def rig_file(folder: Path, *parts: str, name: str = "rig.yaml") -> Path:

@@ -1,5 +1,6 @@
 import sys
 import time
+from functools import partial
 from pkgutil import resolve_name
 
 import pytest
@@ -42,13 +43,20 @@ def profile():
 
 
 @pytest.fixture
-def bench():
+def open_bench():
+    """Makes benches, of a class and its arguments, and closes them after the test."""
+    from tests.drivers.drive_benches import opened
+
+    with opened() as make:
+        yield make
+
+
+@pytest.fixture
+def bench(open_bench):
     """CanopenDrive on the embedded simulator."""
     from tests.drivers.drive_benches import CanopenBench
 
-    bench = CanopenBench()
-    yield bench
-    bench.close()
+    return open_bench(CanopenBench)
 
 
 MAKERS = {
@@ -66,12 +74,9 @@ MAKERS = {
     pytest.param(name, marks=() if name in ("canopen", "ethercat", "modbus") else pytest.mark.heavy)
     for name in sorted(MAKERS)
 ])
-def make_bench(request):
+def make_bench(request, open_bench):
     """Makes benches of one kind of drive (see drive_benches); a further kind joins the contract by its line above."""
-    from tests.drivers.drive_benches import opened
-
-    with opened(resolve_name(f"tests.drivers.{MAKERS[request.param]}")) as make:
-        yield make
+    return partial(open_bench, resolve_name(f"tests.drivers.{MAKERS[request.param]}"))
 
 
 @pytest.fixture

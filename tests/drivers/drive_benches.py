@@ -164,11 +164,11 @@ class CanopenBench:
 
 
 @contextmanager
-def opened(maker):
-    """Yield a function that makes benches, which are closed afterwards."""
+def opened():
+    """Yield a function that makes benches of a kind, which are closed afterwards."""
     with ExitStack() as stack:
-        def make(*arguments, **options):
-            bench = maker(*arguments, **options)
+        def make(kind, *arguments, **options):
+            bench = kind(*arguments, **options)
             stack.callback(bench.close)
             return bench
 

@@ -24,16 +24,8 @@ COUNT_RAD = 2.0 * math.pi / 8192               # of the simulated encoder
 
 
 @pytest.fixture
-def made():
-    benches = []
-
-    def make(kind, **options):
-        benches.append(kind(**options))
-        return Run(benches[-1])
-
-    yield make
-    for bench in benches:
-        bench.close()
+def made(open_bench):
+    return lambda kind, **options: Run(open_bench(kind, **options))
 
 
 def inverter(run):

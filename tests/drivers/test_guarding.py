@@ -92,10 +92,8 @@ def test_an_empty_frame_is_no_answer():
 
 
 @pytest.fixture
-def run():
-    bench = S120Bench()
-    yield Run(bench)
-    bench.close()
+def run(open_bench):
+    return Run(open_bench(S120Bench))
 
 
 def row(found, title):

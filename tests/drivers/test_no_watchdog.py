@@ -154,10 +154,8 @@ def test_other_refusals_stay(canopen, peer):
 
 
 @pytest.fixture
-def guarded():
-    bench = S120Bench()
-    yield Run(bench)
-    bench.close()
+def guarded(open_bench):
+    return Run(open_bench(S120Bench))
 
 
 @pytest.mark.parametrize("how", ["no answer", "no object"])

@@ -11,10 +11,8 @@ from tests.drivers.modbus_bench import ModbusBench
 
 
 @pytest.fixture(params=[CanopenBench, ModbusBench])
-def run(request):
-    bench = request.param()
-    yield Run(bench)
-    bench.close()
+def run(request, open_bench):
+    return Run(open_bench(request.param))
 
 
 def true_angle(bench):

@@ -15,16 +15,8 @@ from tests.drivers.profile_benches import AbbBench, Epos4Bench, S120Bench
 
 
 @pytest.fixture
-def make():
-    made = []
-
-    def make(kind):
-        made.append(kind())
-        return made[-1]
-
-    yield make
-    for bench in made:
-        bench.close()
+def make(open_bench):
+    return open_bench
 
 
 def found_with(bench, index=0, sub=0, value=None):

@@ -12,19 +12,14 @@ TURN_S = 60.0
 
 
 @pytest.fixture
-def make():
-    made = []
-
+def make(open_bench):
     def make(kind):
-        made.append(kind())
-        run = Run(made[-1])
+        run = Run(open_bench(kind))
         run.ready()
         run.enable()
         return run
 
-    yield make
-    for bench in made:
-        bench.close()
+    return make
 
 
 def change(run, index, sub):

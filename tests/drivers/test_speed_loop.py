@@ -24,10 +24,8 @@ ENTRY = {"title": "the manual's", "source": "the manual", "confidence": "likely"
 
 
 @pytest.fixture
-def bench(request):
-    made = request.param(RIG)
-    yield made
-    made.close()
+def bench(request, open_bench):
+    return open_bench(request.param, RIG)
 
 
 def preflight(drive):
@@ -51,12 +49,11 @@ def test_preflight_reads_what_the_simulated_drive_has(bench):
     assert {check.outcome for check in rows_of(found).values()} == {Outcome.NOTE}
 
 
-def test_counts_value_and_place_are_kept():
-    bench = ModbusBench(RIG)
+def test_counts_value_and_place_are_kept(open_bench):
+    bench = open_bench(ModbusBench, RIG)
     present = preflight(bench.drive).speed_loop
     assert (present.gain.raw, present.gain.where, present.gain.unit) == (123450000.0, "register 64", "nm_s_rad")
     assert (present.integral.raw, present.integral.value, present.integral.unit) == (5000000.0, 5000.0, "ms")
-    bench.close()
 
 
 @pytest.mark.parametrize("bench", [CanopenBench], indirect=True)
@@ -68,8 +65,8 @@ def test_an_object_that_is_not_there_is_a_note(bench):
     assert (found.speed_loop.gain, found.speed_loop.gain_nm_s_rad, found.speed_loop.integral_nm_rad) == (None,) * 3
 
 
-def test_a_register_that_is_not_there_is_a_note():
-    bench = ModbusBench(RIG)
+def test_a_register_that_is_not_there_is_a_note(open_bench):
+    bench = open_bench(ModbusBench, RIG)
     profile = load_modbus_profile("generic/modbus")
     parameters = tuple(
         one if one.name != "speed_gain" else one.model_copy(
@@ -83,7 +80,6 @@ def test_a_register_that_is_not_there_is_a_note():
     present = found.speed_loop
     assert present.gain is None and present.integral.value == 5000.0
     assert present.integral_nm_rad is None                     # an integral time alone gives no gain
-    bench.close()
 
 
 def read(values, gain="nm_s_rad", integral="s", smoothing="s", simulated=True, **more):

@@ -12,7 +12,7 @@ from sim_bus.modbus.faults import KINDS, ONLY_ON
 from tests.faults import rehearsal
 from tests.faults.rehearsal import IN_MOTION
 from tests.path.path_runs import host, modbus_peer, tdhil, wait_for
-from tests.rigs import PATIENT, limits_text, rig_file
+from tests.rigs import PATIENT_LIMITS, limits_text, rig_file
 
 NOTICED_S = 0.6                # half the watchdog's time, or all of it, and five cycles
 
@@ -90,7 +90,7 @@ def test_the_list_of_one_bus_is_shorter():
 @pytest.mark.real_time
 def test_a_connection_that_is_reset_in_motion(tmp_path):
     """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
-    rig = rig_file(tmp_path, PATIENT)
+    rig = rig_file(tmp_path, PATIENT_LIMITS)
     with (modbus_peer(tmp_path / "shaft.csv", "--fault", "reset@speed+2s") as drive,
           host(tmp_path, *drive.options, "--rate", 4, "--rig", rig, cwd=tmp_path) as running):
         done = running.finish()

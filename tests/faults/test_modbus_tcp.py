@@ -14,7 +14,7 @@ import pytest
 
 from tests.drivers.modbus_peers import TcpPeer
 from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, modbus_peer, tail_time, wait_for
-from tests.rigs import PATIENT, PATIENT_S, rig_file
+from tests.rigs import PATIENT_LIMITS, PATIENT_S, rig_file
 
 pytestmark = pytest.mark.real_time
 
@@ -65,7 +65,7 @@ class Bench:
     def start(self, port):
         self.host = self.stack.enter_context(host(
             self.folder, "--host", "127.0.0.1", "--port", port, "--rate", RATE_HZ,
-            "--rig", rig_file(self.folder, PATIENT), cwd=self.folder,
+            "--rig", rig_file(self.folder, PATIENT_LIMITS), cwd=self.folder,
         ))
 
     @property

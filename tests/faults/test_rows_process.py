@@ -13,10 +13,6 @@ from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import (
     PATIENT,
     PLAIN,
-    QUICK_STOP_RAD_S2,
-    SETTLING_S,
-    WATCHDOG_S,
-    Shaft,
     host,
     peer,
     tail_time,
@@ -40,21 +36,10 @@ def turning(no_bus_of_the_user, tmp_path, request):
         yield drive, running
 
 
-def rests(trace):
-    shaft = Shaft.read(trace)
-    lost = shaft.events("host heartbeat lost")
-    return bool(lost) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5 and shaft.at_rest_from() >= lost[0]
-
-
 def stopped_by_its_watchdog(drive):
-    wait_for("the end of the stop", lambda: rests(drive.trace))
+    wait_for("the end of the stop", drive.rests_after_watchdog)
     shaft = drive.shaft
-    (silent_s,), (lost_s,) = shaft.events("running on in own time"), shaft.events("host heartbeat lost")
-    assert lost_s - silent_s <= WATCHDOG_S + CYCLE_S
-    assert shaft.at_rest_from() - lost_s <= shaft.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
-    assert shaft.state[-1] == "quick stop active"
-    shaft.assert_at_rest()
-    return round(shaft.at_rest_from() - silent_s, 2)
+    return round(shaft.at_rest_from() - shaft.assert_stopped_by_watchdog(CYCLE_S), 2)
 
 
 @pytest.mark.heavy

@@ -138,6 +138,15 @@ class Shaft:
         assert self.at_rest_from() <= self.time_s[-1] - 1.0
         self.assert_never_let_go()
 
+    def assert_stopped_by_watchdog(self, cycle_s: float) -> float:
+        """The drive noticed the silent host in time and braked on its ramp; when the silence began."""
+        (silent_s,), (lost_s,) = self.events("running on in own time"), self.events("host heartbeat lost")
+        assert lost_s - silent_s <= WATCHDOG_S + cycle_s
+        assert self.at_rest_from() - lost_s <= self.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
+        assert self.state[-1] == "quick stop active"        # held, until somebody comes
+        self.assert_at_rest()
+        return silent_s
+
     def assert_stopped_within_settings(self) -> float:
         """A quick stop by the host brought it to rest on the ramp that the settings give; when that began."""
         begun_s = self.events("state: quick stop active")[-1]
@@ -239,6 +248,12 @@ class Traced:
     def shaft(self) -> Shaft:
         """What the shaft has done so far."""
         return self._follower.read()
+
+    def rests_after_watchdog(self) -> bool:
+        """The drive's own reaction is over, and the shaft has stood for more than a second."""
+        shaft = self.shaft
+        lost = shaft.events("host heartbeat lost")
+        return bool(lost) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5 and shaft.at_rest_from() >= lost[0]
 
 
 @dataclass

@@ -12,12 +12,12 @@ import time
 import pytest
 
 from tests.path.path_runs import HANGS_S, REAL, Terminal, host, identify, peer, tail_time, wait_for
-from tests.rigs import PATIENT, PATIENT_S, rig_file
+from tests.rigs import PATIENT_LIMITS, PATIENT_S, rig_file
 
 pytestmark = pytest.mark.real_time
 
 ACCEPTED = "accept_unverified: [likely]\n"
-RIG = f"rate_hz: 4\n{ACCEPTED}{PATIENT}name: bench 3\nrun: {{excitation: sine, frequency_hz: 0.2}}\n"
+RIG = f"rate_hz: 4\n{ACCEPTED}{PATIENT_LIMITS}name: bench 3\nrun: {{excitation: sine, frequency_hz: 0.2}}\n"
 
 
 @pytest.fixture

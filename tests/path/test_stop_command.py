@@ -8,7 +8,7 @@ import can
 import pytest
 
 from tests.path.path_runs import HANGS_S, QUICK, host, peer, process, tdhil, wait_for
-from tests.rigs import PATIENT, rig_file
+from tests.rigs import PATIENT_LIMITS, rig_file
 
 pytestmark = pytest.mark.real_time
 
@@ -103,7 +103,7 @@ def test_a_quick_stop_that_would_coast_is_replaced_first(turning):
 @pytest.mark.heavy
 def test_while_a_run_of_ours_is_under_way(tmp_path):
     """Two masters, three processes: the run sees its drive taken from it, and ends by its own stop."""
-    rig = rig_file(tmp_path, "rate_hz: 4\n", PATIENT)
+    rig = rig_file(tmp_path, "rate_hz: 4\n", PATIENT_LIMITS)
     with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
         assert running.wait_for_line("stage speed …"), running.err
         turns = wait_for("speed", lambda: max(drive.shaft.speed_rad_s, default=0.0) > 1.0, running.child)

@@ -12,7 +12,7 @@ import pytest
 from tdhil.recording import read_run
 from tdhil.service.run_state import State
 from tests.path.path_runs import modbus_peer
-from tests.rigs import PATIENT, rig_file
+from tests.rigs import PATIENT_LIMITS, rig_file
 from tests.service.conftest import Service, wait_for
 
 simulated_drive = partial(modbus_peer, program=("-m", "tdhil", "simulate"))
@@ -21,7 +21,7 @@ simulated_drive = partial(modbus_peer, program=("-m", "tdhil", "simulate"))
 
 def attended_rig(port: object) -> str:
     """Return the rig.yaml of a Modbus drive that a person at the shaft releases."""
-    return (f"name: bench 3\nrate_hz: 10\nmodbus: {{host: 127.0.0.1, port: {port}}}\n{PATIENT}"
+    return (f"name: bench 3\nrate_hz: 10\nmodbus: {{host: 127.0.0.1, port: {port}}}\n{PATIENT_LIMITS}"
             "service: {motion: attended}\n")
 
 

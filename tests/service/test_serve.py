@@ -27,7 +27,7 @@ from tdhil.service import AccountsFile, attend, server
 from tdhil.service.client import ServiceError
 from tdhil.service.server import require_way
 from tdhil.service.store import Store
-from tests.rigs import PATIENT, rig_file
+from tests.rigs import PATIENT_LIMITS, rig_file
 from tests.service.conftest import HANGS_S, folder_of_locks, wait_for
 
 QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
@@ -152,7 +152,7 @@ def test_its_end_brakes_what_moves(tmp_path):
     """SIGTERM, as of `systemctl stop`: the shaft is at rest before the service ends. A stop of a page comes to the
     same."""
     (tmp_path / "rigs").mkdir()
-    rig_file(tmp_path / "rigs", "drive: modbus\nrun: {simulate: true}\n", PATIENT)
+    rig_file(tmp_path / "rigs", "drive: modbus\nrun: {simulate: true}\n", PATIENT_LIMITS)
     with served(tmp_path / "data", "--rigs", str(tmp_path / "rigs")) as server:
         run = server.client.start("rig", real_time=True)["id"]
         wait_for("motion", lambda: server.client.run(run)["state"] == "moving")
@@ -171,7 +171,7 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
     """The run's own process counts: there is no web any more that could tell it."""
     rigs, data = tmp_path / "rigs", tmp_path / "data"
     rigs.mkdir()
-    rig_file(rigs, "rate_hz: 20\nrun: {simulate: true}\n", PATIENT, "service: {motion: watched}\n")
+    rig_file(rigs, "rate_hz: 20\nrun: {simulate: true}\n", PATIENT_LIMITS, "service: {motion: watched}\n")
     with served(data, "--rigs", str(rigs)) as server:
         with pytest.raises(UsageError, match="no service runs"):
             attend(tmp_path, print)

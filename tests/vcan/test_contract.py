@@ -29,8 +29,8 @@ from tests.vcan.vcan_bench import VcanBench
 
 @pytest.fixture
 def make_bench(vcan):
-    with opened(partial(VcanBench, vcan)) as make:
-        yield make
+    with opened() as make:
+        yield partial(make, VcanBench, vcan)
 
 
 @pytest.fixture

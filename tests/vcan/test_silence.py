@@ -15,7 +15,7 @@ import pytest
 
 from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wait_for
-from tests.rigs import PATIENT, rig_file
+from tests.rigs import PATIENT_LIMITS, rig_file
 from tests.vcan.candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
 from tests.vcan.vcan_runs import TURNING_RAD_S, assert_safe, simulated
 
@@ -30,7 +30,7 @@ def lost(drive):
 
 
 def test_a_frozen_host_is_silent_and_wakes_with_nothing_stale(tmp_path, vcan, tool):
-    rig = rig_file(tmp_path, f"rate_hz: {RATE_HZ}\n", PATIENT)
+    rig = rig_file(tmp_path, f"rate_hz: {RATE_HZ}\n", PATIENT_LIMITS)
     on = ("-i", "socketcan", "-c", vcan)
     with watching(tool("candump"), tmp_path / "candump.log", vcan) as candump:
         with simulated(tmp_path, vcan, stepped=False) as drive, host(tmp_path, *on, "--rig", rig) as running:
