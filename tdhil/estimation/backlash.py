@@ -119,7 +119,7 @@ class _SegmentAngle:
 
 
 @dataclass(frozen=True)
-class _Gap:
+class _GapMotion:
     """C candidates of the motion between the flanks: ln λ, a₀, rad/s², b, 1/s, and e; (C,) each."""
 
     log_rate: FloatArray
@@ -128,7 +128,7 @@ class _Gap:
     rebound: FloatArray
 
     @classmethod
-    def of(cls, rows: FloatArray) -> _Gap:
+    def of(cls, rows: FloatArray) -> _GapMotion:
         """Return the candidates of a table (C, 4)."""
         return cls(*rows.T)
 
@@ -156,7 +156,7 @@ class _Gap:
 
 
 @dataclass(frozen=True)
-class _Likelihood:
+class _PlayLikelihood:
     """−2 ln L of C candidates (C,), with η (C,) of each, rad, and the variance (C, U) of all that is left."""
 
     value: FloatArray
@@ -165,7 +165,7 @@ class _Likelihood:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _AllSegments:
     """All segments, their unexcited harmonics in one row."""
 
     segments: tuple[_SegmentAngle, ...]
@@ -183,7 +183,7 @@ class _Seen:
         """Return z of candidates (C, 4) at the unexcited harmonics (C, U), and at the excited ones, (K, C) of each
         segment. ``play``: y at the excited harmonics, as far as it is known.
         """
-        found = [_Gap.of(rows).waves(one, steps, own) for one, own in zip(self.segments, play, strict=True)]
+        found = [_GapMotion.of(rows).waves(one, steps, own) for one, own in zip(self.segments, play, strict=True)]
         free = [lines[:, one.unexcited.astype(np.int64) - 1] for one, lines in zip(self.segments, found, strict=True)]
         excited = tuple(lines[:, one.places].T for one, lines in zip(self.segments, found, strict=True))
         return np.concatenate(free, axis=1), excited
@@ -194,13 +194,13 @@ class _Seen:
         before, after = (float(np.sum(np.abs(rest) ** 2 / noise)) for rest in (self.rest, self.rest - angle))
         return min(1.0, (before - after) / max(before - len(noise), 1e-300))
 
-    def likelihood(self, z: ComplexArray | None) -> _Likelihood:
+    def likelihood(self, z: ComplexArray | None) -> _PlayLikelihood:
         """Return the likelihood of candidates with z (C, U), or without backlash; at the best η and distortion."""
         rest, noise = self.rest, np.concatenate([one.variance for one in self.segments])
         harmonics = np.concatenate([one.unexcited for one in self.segments])
         lowest = int(np.argmin(harmonics))
         count = 1 if z is None else len(z)
-        best = _Likelihood(np.full(count, math.inf), np.zeros(count), np.zeros((count, len(rest))))
+        best = _PlayLikelihood(np.full(count, math.inf), np.zeros(count), np.zeros((count, len(rest))))
         for power, level in itertools.product(_SLOPES, _LEVELS):
             variance = noise + level * noise[lowest] * (harmonics / harmonics[lowest]) ** (-2.0 * power)
             value = np.full(count, 2.0 * float(np.sum(np.log(variance) + np.abs(rest) ** 2 / variance)))
@@ -210,16 +210,16 @@ class _Seen:
                 size = np.maximum((z.conj() * (rest / variance)).real.sum(axis=1) / energy, 0.0)
                 value = value - 2.0 * size**2 * energy
             better = value < best.value
-            best = _Likelihood(np.where(better, value, best.value), np.where(better, size, best.size),
+            best = _PlayLikelihood(np.where(better, value, best.value), np.where(better, size, best.size),
                                np.where(better[:, None], variance, best.variance))
         return best
 
 
 @dataclass(frozen=True)
 class _FittedBacklash:
-    """A backlash: ``row`` (4,) of `_Gap`, η, rad, the decrease of −2 ln L, and the covariance (5, 5) of ln η and the
-    row. ``play``: y at the excited harmonics, (K, 1) of each segment. ``explained``: share of the angle beyond noise,
-    in power, that the play explains.
+    """A backlash: ``row`` (4,) of `_GapMotion`, η, rad, the decrease of −2 ln L, and the covariance (5, 5) of ln η and
+    the row. ``play``: y at the excited harmonics, (K, 1) of each segment. ``explained``: share of the angle beyond
+    noise, in power, that the play explains.
     """
 
     row: FloatArray
@@ -259,7 +259,7 @@ def with_backlash(case: PeriodicCase, finding: Finding) -> Finding:
                 if (one := _angle_of(stretch, readings, finding)) is not None}
     if not segments:
         return finding
-    fitted = _fitted(_Seen(tuple(segments.values())))
+    fitted = _fitted(_AllSegments(tuple(segments.values())))
     if fitted is None:
         return replace(finding, backlash=())
     found = fitted.estimate(case.options.confidence)
@@ -387,7 +387,7 @@ def _smoothed(harmonics: FloatArray, scatter: FloatArray, freedom: int) -> Float
 # The fit
 
 
-def _fitted(seen: _Seen) -> _FittedBacklash | None:
+def _fitted(seen: _AllSegments) -> _FittedBacklash | None:
     """Return the likeliest backlash; None if it does not explain more than other distortion would."""
     without = float(seen.likelihood(None).value[0])
     motions = [one.motion(_COARSE_STEPS, still)[0][:, 0] for one, still in zip(seen.segments, seen.still, strict=True)]
@@ -412,7 +412,7 @@ def _fitted(seen: _Seen) -> _FittedBacklash | None:
     return _descended(seen, rows[place.ravel()], largest, without)
 
 
-def _grid(seen: _Seen, motions: list[FloatArray], largest: float) -> FloatArray:
+def _grid(seen: _AllSegments, motions: list[FloatArray], largest: float) -> FloatArray:
     """Return the candidates of the first look, (C, 4)."""
     jerk = float(np.mean([np.mean(np.abs(np.diff(motion))) * len(motion) / one.period_s
                           for motion, one in zip(motions, seen.segments, strict=True)]))
@@ -426,7 +426,7 @@ def _grid(seen: _Seen, motions: list[FloatArray], largest: float) -> FloatArray:
         if mean_rad_s > 0.0 or not share])
 
 
-def _descended(seen: _Seen, rows: FloatArray, largest: float, without: float) -> _FittedBacklash | None:
+def _descended(seen: _AllSegments, rows: FloatArray, largest: float, without: float) -> _FittedBacklash | None:
     """Return the likeliest backlash that Levenberg and Marquardt's steps find from any of the starts (C, 4).
 
     The play is also in the excited lines of the angle. Each step subtracts it there, as it is known so far.
@@ -465,7 +465,7 @@ def _descended(seen: _Seen, rows: FloatArray, largest: float, without: float) ->
 
 
 def _slopes(
-    seen: _Seen, rows: FloatArray, unit: FloatArray, play: _Lines
+    seen: _AllSegments, rows: FloatArray, unit: FloatArray, play: _Lines
 ) -> tuple[ComplexArray, ComplexArray, _Lines]:
     """Return z (C, U); z again and its slopes over the four quantities of a row, (C, 5, U); z at the excited lines."""
     step, count = _STEP * unit, len(rows)

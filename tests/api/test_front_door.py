@@ -93,7 +93,7 @@ def test_a_result_shows_itself_as_the_card(record, capsys):
     assert max(map(len, str(result).splitlines())) <= 80
     assert "SIMULATED" in repr(record)
     assert repr(result).startswith(f"<SIMULATED {result.verdict.value}: {result.inertia.value:.1f} (")
-    assert repr(result).endswith(f" %, {record.log}>")
+    assert repr(result).endswith(f" kg·m², {record.log}>")
     known = {"value": 104.0, "low_total": 100.0, "high_total": 108.0}
     with_number = replace(result, document={**result.document, "inertia_kg_m2": known})
     assert "104.0 (100.0 to 108.0) kg·m²" in repr(with_number)

@@ -41,6 +41,7 @@ class Stated(ProfileEntry):
     ends: Literal["off", "held"] = "held"
     kind: str = "lease"
     reaction: str = "quick_stop"
+    decelerates_in_torque_mode: bool = True
 
 
 class ToyProfile(DriveProfile):

@@ -94,7 +94,7 @@ def test_an_option_is_added_in_one_line_and_is_there_in_all_six_places(tmp_path)
     assert (seen["rig.yaml"], seen["source"]) == (1.5, "rig.yaml:1")
     assert seen["python"]
     assert seen["api"] == {"dwell_s": 2.0} and seen["schema"]["x-unit"] == "s"
-    assert re.search(r"Dwell, s\s*<input name=\"dwell_s\"", seen["form"])
+    assert re.search(r"Dwell, s</span>\s*<input name=\"dwell_s\"", seen["form"])
     row = "| `run.dwell_s` | – | `--dwell` | s; time at the mean speed before stage 5 |"
     assert row in seen["page"].splitlines()
     assert "dwell_s: must be at most 60, not 61" in refused[0] and "--dwell" not in refused[0]

@@ -14,16 +14,20 @@ NOTICED_S = WATCHDOG_S + 0.1
 """By the host within half of that, by the drive's own watchdog within all of it, and five cycles."""
 
 
+READS = (0x03, 0x04)
+"""Function codes that only read."""
+
+
 class Line:
     """Between driver and simulated drive; ``becomes(serve, unit, pdu, now_s)`` → (reply or None, when complete)."""
 
     def __init__(self, monkeypatch):
-        self.becomes, self.left = None, 0
+        self.becomes, self.left, self.writes_only = None, 0, False
         serve = embedded.EmbeddedModbusDrive.serve
         line = self
 
         def passing(self, unit, pdu, now_s):
-            if line.becomes is None or line.left <= 0:
+            if line.becomes is None or line.left <= 0 or (line.writes_only and pdu[0] in READS):
                 return serve(self, unit, pdu, now_s)
             line.left -= 1
             return line.becomes(partial(serve, self), unit, pdu, now_s)
@@ -31,7 +35,8 @@ class Line:
         monkeypatch.setattr(embedded.EmbeddedModbusDrive, "serve", passing)
 
     def begin(self, becomes, requests):
-        self.becomes, self.left = becomes, requests
+        """Change this many requests. A single one is a write of the cycle: a check of settings is read again."""
+        self.becomes, self.left, self.writes_only = becomes, requests, requests == 1
 
 
 def refusing(code):

@@ -407,16 +407,16 @@
 
   /**
    * Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn again for another width or
-   * colour scheme. `place` names the place of a point, `unit` is that of its value. `speed`: x is a speed in rad/s.
+   * colour scheme. `nameOf` names a point, `unit` is that of its value. `speed`: x is a speed in rad/s.
    */
-  function points(where, series, { label, place, unit, time = false, speed = false, marks = [] }) {
+  function points(where, series, { label, nameOf, unit, time = false, speed = false, marks = [] }) {
     const all = series.flatMap((one) => one.points), shown = speed ? inSpeedUnit : (x) => x;
     const places = [...new Set(all.map((one) => one.x))].sort((a, b) => a - b);
     let xs = places.map(shown);
-    const read = reading(where, (at) => {
-      const x = places[nearest(xs, at)], valueOf = (one) => `${of(one)} ${unit}`;
+    const read = reading(where, (cursor) => {
+      const x = places[nearest(xs, cursor)], valueOf = (one) => `${of(one)} ${unit}`;
       const here = series.flatMap((one, k) => one.points.filter((point) => point.x === x).map((point) => [k, point]));
-      return `${place(here[0][1])}: ${here.map(([k, point]) => (series.length > 1 ? tr("run {number}: {value}", { number: k + 1, value: valueOf(point) }) : valueOf(point))).join("; ")}`;
+      return `${nameOf(here[0][1])}: ${here.map(([k, point]) => (series.length > 1 ? tr("run {number}: {value}", { number: k + 1, value: valueOf(point) }) : valueOf(point))).join("; ")}`;
     });
     const low = Math.min(...all.map((one) => one.low ?? one.value)), high = Math.max(...all.map((one) => one.high ?? one.value));
     const pad = 0.1 * (high - low) || 0.05 * Math.abs(high) || 1, sideOf = () => Math.max(0.06 * (xs[xs.length - 1] - xs[0]), time ? 60 : 1e-3);
@@ -501,7 +501,7 @@
           el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot, el("p", { class: "dim said" }, where.dataset.said)),
           numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("span", {}, el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), " ", rehearsal(one.rehearsed_faults) || ""), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
-          { time: true, place: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
+          { time: true, nameOf: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
     }, tr("The results are compared"), "history");
   }
@@ -522,11 +522,11 @@
       const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
         tr("{quantity}, {run} against 1", { quantity: word(other.name), run: k + 2 }), other.differs ? tr("differs") : tr("no significant difference"),
         other.relative ? tr("{value} ({low} to {high})", { value: percentOf(other.change), low: percentOf(other.low), high: percentOf(other.high) }) : `${tr("{value} ({low} to {high})", { value: number(other.change, 3), low: number(other.low, 3), high: number(other.high, 3) })} ${other.unit}`]));
-      const curve = (title, label, key, x, said, unit, place, speed = false) => {
+      const curve = (title, label, key, x, said, unit, nameOf, speed = false) => {
         const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
         if (!series.some((one) => one.points.length)) return [];
         const plot = el("div", { class: "plot", role: "img", "aria-label": title });
-        setTimeout(() => points(plot, series, { label, place, unit, speed }), 0);             // after it has a width
+        setTimeout(() => points(plot, series, { label, nameOf, unit, speed }), 0);             // after it has a width
         return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot, el("p", { class: "dim said" }, said)),
           numbers(tr("{title}, in numbers", { title }), [speed ? ofSpeed(label) : label(), ...names], tabled(series, speed ? (x) => ofSpeed(() => number(inSpeedUnit(x))) : number))];
       };
@@ -546,9 +546,9 @@
   const percentOf = (share) => `${share > 0 ? "+" : ""}${precise(100 * share, 2)} %`;
   const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
   /** A row for each place, a cell for each series; the mean of several points at one place. */
-  function tabled(series, place = number) {
+  function tabled(series, nameOf = number) {
     const xs = [...new Set(series.flatMap((one) => one.points.map((point) => Number(point.x.toPrecision(6)))))].sort((a, b) => a - b);
-    return xs.map((x) => [place(x), ...series.map((one) => {
+    return xs.map((x) => [nameOf(x), ...series.map((one) => {
       const here = one.points.filter((point) => Number(point.x.toPrecision(6)) === x).map((point) => point.value);
       return here.length ? number(here.reduce((sum, value) => sum + value, 0) / here.length) : "–";
     })]);
