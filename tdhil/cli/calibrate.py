@@ -138,7 +138,19 @@ def _wanted(namespace: argparse.Namespace) -> Wanted:
     logs, added = namespace.logs, namespace.added
     _positive("--added", added)
     _positive("--added-sd", namespace.added_sd, zero=True)
-    bodies = [_body(text) for text in namespace.body]
+    bodies: Wanted = []
+    for text in namespace.body:
+        name, equals, value = text.rpartition("=")
+        number, _, sd = value.replace("+-", "±").partition("±")
+        try:
+            body = Path(name), float(number), float(sd) if sd else None
+        except ValueError:
+            equals = ""
+        if not equals or not name:
+            raise UsageError(f"{text[:60]!r} is not FILE=J", where="--body", next_step="Such as --body with.mcap=55.0")
+        _positive("--body", body[1], zero=True)
+        _positive("--body", body[2], zero=True)
+        bodies.append(body)
     if added is None:
         if namespace.added_sd is not None:
             raise UsageError("needs --added, the inertia that it is the uncertainty of", where="--added-sd")
@@ -154,20 +166,6 @@ def _wanted(namespace: argparse.Namespace) -> Wanted:
 def _positive(flag: str, value: float | None, *, zero: bool = False) -> None:
     if value is not None and not ((value > 0.0 or (zero and value == 0.0)) and value <= _LARGEST):
         raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
-
-
-def _body(text: str) -> tuple[Path, float, float | None]:
-    name, equals, value = text.rpartition("=")
-    number, _, sd = value.replace("+-", "±").partition("±")
-    try:
-        found = Path(name), float(number), float(sd) if sd else None
-    except ValueError:
-        equals = ""
-    if not equals or not name:
-        raise UsageError(f"{text[:60]!r} is not FILE=J", where="--body", next_step="Such as --body with.mcap=55.0")
-    _positive("--body", found[1], zero=True)
-    _positive("--body", found[2], zero=True)
-    return found
 
 
 def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]:

@@ -5,7 +5,6 @@ pipe.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -34,6 +33,9 @@ _EXAMPLES = {
 
 def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
     """Read, fit, print, save. The kind is the single given option of `WITHOUT_BODY`."""
+    from tdhil.report import PlainConsole, factor_report, print_factor, stderr_console
+    from tdhil.session import save_calibration
+
     kind, *others = [name for name in WITHOUT_BODY if getattr(namespace, name) is not None]
     unwanted = [*others, *(name for name in _BODY if getattr(namespace, name)),
                 *(name for name, needed in _NEEDS.items() if needed != kind and getattr(namespace, name) is not None)]
@@ -43,24 +45,6 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
     require_new(namespace.save)
     report = ReportFile.of_files(namespace, getattr(namespace, kind), *namespace.logs)
     document, record = _KINDS[kind](namespace, confidence)
-    code = _print_result(namespace, document)
-    if report is not None:
-        from tdhil.report import factor_report
-
-        report.write(factor_report(document), () if record is None else (record.configuration,))
-    return code
-
-
-def require_new(path: Path | None) -> None:
-    """Raise UsageError if the file exists already."""
-    if path is not None and path.exists():
-        raise existing_file(f"--save {path}")
-
-
-def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) -> int:
-    from tdhil.report import PlainConsole, print_factor, stderr_console
-    from tdhil.session import save_calibration
-
     console = stderr_console()
     if namespace.json:
         print_json(document)
@@ -73,7 +57,15 @@ def _print_result(namespace: argparse.Namespace, document: Mapping[str, Any]) ->
     elif namespace.save is not None:
         console.print(f"tdhil: nothing was written to {namespace.save}: there is no calibration factor",
                       style="yellow", markup=False, soft_wrap=True)
+    if report is not None:
+        report.write(factor_report(document), () if record is None else (record.configuration,))
     return int(ExitCode.OK if found else ExitCode.NOT_IDENTIFIABLE)
+
+
+def require_new(path: Path | None) -> None:
+    """Raise UsageError if the file exists already."""
+    if path is not None and path.exists():
+        raise existing_file(f"--save {path}")
 
 
 def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:

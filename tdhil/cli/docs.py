@@ -27,7 +27,10 @@ def run(namespace: argparse.Namespace) -> int:
     names = [path.relative_to(folder).as_posix() for path in found]
     width = max(map(len, names))
     for name, path in zip(names, found, strict=True):
-        print(f"  {name:<{width}} {shorten(_title(path), 77 - width, placeholder=' …')}")  # noqa: T201
+        with path.open(encoding="utf-8") as file:
+            title = next((line.strip('#" \n') for line in file
+                          if line.strip('#" \n') and not line.startswith("<!--")), "")
+        print(f"  {name:<{width}} {shorten(title, 77 - width, placeholder=' …')}")  # noqa: T201
     return 0
 
 
@@ -40,8 +43,3 @@ def docs_folder() -> Path:
     raise UsageError("this installation contains no documentation", where=str(package),
                      next_step="Install it again from its wheel, or use the clone that it came from",
                      entry=MessageCode.PACKAGE_MISSING)
-
-
-def _title(path: Path) -> str:
-    with path.open(encoding="utf-8") as file:
-        return next((line.strip('#" \n') for line in file if line.strip('#" \n') and not line.startswith("<!--")), "")

@@ -170,7 +170,17 @@ def run(namespace: argparse.Namespace) -> int:
             "exit_code": int(code),
         })
     else:
-        _show_registers(registers)
+        if registers:
+            from rich.table import Table
+
+            from tdhil.report import PlainConsole
+
+            table = Table(title="registers, as read; compare them with the drive's panel", title_justify="left")
+            for heading in ("address", "counts", "is", "meaning"):
+                table.add_column(heading, overflow="fold")
+            for register in registers:
+                table.add_row(*register.cells())
+            PlainConsole().print(table)
         bad = sum(one.grade == "bad" for one in found)
         print("no obstacle was found" if not bad else f"{bad} to correct, see 'bad'")  # noqa: T201
     return int(code)
@@ -234,19 +244,3 @@ def _limits(rig: Rig | None) -> Iterator[DoctorFinding]:
     else:
         step = "Add a section limits: to rig.yaml, and name the file with --rig"
         yield note("limits", "none: a real drive will not be moved", step)
-
-
-def _show_registers(registers: list[ValueSeen]) -> None:
-    """Show each register with its meaning, to compare with the drive's panel."""
-    if not registers:
-        return
-    from rich.table import Table
-
-    from tdhil.report import PlainConsole
-
-    table = Table(title="registers, as read; compare them with the drive's panel", title_justify="left")
-    for heading in ("address", "counts", "is", "meaning"):
-        table.add_column(heading, overflow="fold")
-    for one in registers:
-        table.add_row(*one.cells())
-    PlainConsole().print(table)

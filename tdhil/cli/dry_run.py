@@ -160,16 +160,8 @@ def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, c
     from rich.text import Text
 
     console.print(Text("DRY RUN: nothing is connected, nothing moves", style="magenta"))
-    console.print(_motion_table(planned, limits))
-    if lines := planned.plan.lines():
-        console.print(_lines_table(lines))
-    console.print(_figures_table(figures))
-    for text in _conclusions(planned):
-        console.print(Text(text))
-
-
-def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
-    plan, table = planned.plan, _table(f"stage 5: {planned.plan.kind} in {planned.plan.mode} mode")
+    plan = planned.plan
+    table = _table(f"stage 5: {plan.kind} in {plan.mode} mode")
     for heading in ("", "planned", "limit"):
         table.add_column(heading, overflow="fold")
     table.add_row(
@@ -183,28 +175,23 @@ def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
     table.add_row("time, s", f"{planned.duration_s:.0f} (+ about {BEFORE_ACQUIRE_S:.0f})", f"{limits.time_s:g}")
     for where, what in plan.parts():
         table.add_row(where, what, "")
-    return table
-
-
-def _lines_table(lines: list[tuple[float, float]]) -> Table:
-    table = _table("lines")
-    table.add_column("Hz", justify="right")
-    table.add_column("amplitude, rad/s", justify="right")
-    for hertz, amplitude in lines:
-        table.add_row(f"{hertz:.4g}", f"{amplitude:.3g}")
-    return table
-
-
-def _figures_table(figures: tuple[Figure, ...]) -> Table:
-    from rich.text import Text
-
+    console.print(table)
+    if lines := plan.lines():
+        table = _table("lines")
+        table.add_column("Hz", justify="right")
+        table.add_column("amplitude, rad/s", justify="right")
+        for hertz, amplitude in lines:
+            table.add_row(f"{hertz:.4g}", f"{amplitude:.3g}")
+        console.print(table)
     table = _table("assumptions")
     for heading in ("", "value", "from"):
         table.add_column(heading, overflow="fold")
     for figure in figures:
-        assumed = figure.source == "assumed"
-        table.add_row(figure.name, figure.text, Text("assumed", "yellow") if assumed else figure.source)
-    return table
+        table.add_row(figure.name, figure.text,
+                      Text("assumed", "yellow") if figure.source == "assumed" else figure.source)
+    console.print(table)
+    for text in _conclusions(planned):
+        console.print(Text(text))
 
 
 def _conclusions(planned: Planned) -> list[str]:

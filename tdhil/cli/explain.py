@@ -60,7 +60,11 @@ def run(namespace: argparse.Namespace) -> int:
         shown = documents if namespace.code is None else documents[0]
         print(json.dumps(shown, ensure_ascii=False, indent=2))  # noqa: T201
     elif namespace.code is None:
-        print(_listing())  # noqa: T201
+        rows = []
+        for group, (title, code, _) in GROUPS.items():
+            rows.append(f"\n{title} (exit code {code})")
+            rows += [f"  {entry.code:<9} {entry.title}" for entry in MessageCode if entry.group == group]
+        print("\n".join(rows).lstrip("\n"))  # noqa: T201
     else:
         print(text(wanted[0]))  # noqa: T201
     return 0
@@ -90,14 +94,6 @@ def page() -> str:
         parts += [f"\n### {entry.code} {entry.title}\n\n{entry.cause}\n\n*Cure:* {entry.cure}\n"
                   for entry in MessageCode if entry.group == group]
     return "".join(parts)
-
-
-def _listing() -> str:
-    rows = []
-    for group, (title, code, _) in GROUPS.items():
-        rows.append(f"\n{title} (exit code {code})")
-        rows += [f"  {entry.code:<9} {entry.title}" for entry in MessageCode if entry.group == group]
-    return "\n".join(rows).lstrip("\n")
 
 
 def _entry(code: str) -> MessageCode:

@@ -78,7 +78,13 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
     """Write frames with python-can's own writers. Raises UsageError if the log has no CAN frames."""
     import can
 
-    frames = _can_frames(path)
+    from tdhil.buses import bus_named
+    from tdhil.config import BUSES
+    from tdhil.recording import CAN, CHANNELS, read_frames, read_run
+
+    bus = read_run(path).configuration.get("drive")
+    # older logs have Modbus bytes on the topic of CAN frames
+    frames = read_frames(path) if bus not in BUSES or bus_named(bus).frame_topic == CHANNELS[CAN][0] else iter(())
     first = next(frames, None)
     if first is None:
         raise UsageError("contains no CAN frames, for example because the run was on Modbus", where=str(path),
@@ -95,16 +101,6 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
             count += 1
             frame = next(frames, None)
     return count
-
-
-def _can_frames(path: Path) -> Iterator[RawFrame]:
-    """Yield CAN frames; none for another bus: older logs have Modbus bytes on the topic of CAN frames."""
-    from tdhil.buses import bus_named
-    from tdhil.config import BUSES
-    from tdhil.recording import CAN, CHANNELS, read_frames, read_run
-
-    bus = read_run(path).configuration.get("drive")
-    return read_frames(path) if bus not in BUSES or bus_named(bus).frame_topic == CHANNELS[CAN][0] else iter(())
 
 
 def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:

@@ -78,6 +78,8 @@ def run(namespace: argparse.Namespace) -> int:
 
 def run_watch(namespace: argparse.Namespace) -> int:
     """Identify new logs repeatedly until Ctrl-C."""
+    from tdhil.report import PlainConsole
+
     folder: Path = namespace.folder
     if not folder.is_dir():
         raise UsageError("this folder does not exist", where=str(folder), entry=MessageCode.FILE_NOT_FOUND)
@@ -87,7 +89,11 @@ def run_watch(namespace: argparse.Namespace) -> int:
         print(f"watching {folder}, table {request.out}; Ctrl-C ends it", file=sys.stderr)  # noqa: T201
     while True:
         for row in watch.look(at_once=namespace.once):
-            _print_row(row, namespace.json)
+            if namespace.json:
+                sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
+            else:
+                PlainConsole().print(f"{_log_text(row)}: {_result_text(row)}", soft_wrap=True)
+            sys.stdout.flush()
         if namespace.once:
             return int(ExitCode.OK)
         time.sleep(namespace.every)
@@ -126,16 +132,6 @@ def _stamp(log: str) -> tuple[int, int]:
     except OSError:
         return 0, 0
     return found.st_size, found.st_mtime_ns
-
-
-def _print_row(row: FleetRow, as_json: bool) -> None:
-    from tdhil.report import PlainConsole
-
-    if as_json:
-        sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
-    else:
-        PlainConsole().print(f"{_log_text(row)}: {_result_text(row)}", soft_wrap=True)
-    sys.stdout.flush()
 
 
 def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -> FleetRequest:

@@ -23,7 +23,6 @@ from tdhil.session import is_evaluation, is_verification, require_file
 
 if TYPE_CHECKING:
     from tdhil.api import Result
-    from tdhil.session import RunRecord
 
 _TABLES: Final = (".csv", ".parquet")
 _PICTURES: Final = (".png", ".svg", ".pdf")
@@ -50,7 +49,11 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.api import identify
     from tdhil.report import PlainConsole, print_responses, stderr_console
 
-    logs = _logs(namespace)
+    logs: list[Path] = list(namespace.logs)
+    while namespace.columns and "=" not in namespace.columns[-1]:
+        logs.insert(len(namespace.logs), Path(namespace.columns.pop()))
+    if not logs:
+        raise UsageError("no log is named", next_step="For example: tdhil frf run.mcap", entry=MessageCode.LOG_NEEDED)
     settings = settings_in(namespace)
     check_trace(namespace)
     for path in logs:
@@ -82,15 +85,6 @@ def run(namespace: argparse.Namespace) -> int:
     return int(ExitCode.OK if whole else ExitCode.PARTIAL)
 
 
-def _logs(namespace: argparse.Namespace) -> list[Path]:
-    logs: list[Path] = list(namespace.logs)
-    while namespace.columns and "=" not in namespace.columns[-1]:
-        logs.insert(len(namespace.logs), Path(namespace.columns.pop()))
-    if not logs:
-        raise UsageError("no log is named", next_step="For example: tdhil frf run.mcap", entry=MessageCode.LOG_NEEDED)
-    return logs
-
-
 def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
     """Check both files before a log is read. Raises UsageError."""
     for flag, path, endings in (("--out", namespace.out, _TABLES), ("--plot", namespace.plot, _PICTURES)):
@@ -120,19 +114,18 @@ def _part(result: Result) -> dict[str, Any]:
     """Return one log's response as plain data; without a response, ``reason`` states why."""
     document = result.document
     part = {name: document[name] for name in ("log", "simulated", "frequency_response")}
-    return part | {"reason": None if part["frequency_response"] is not None else _reason(result.record, result)}
-
-
-def _reason(recorded: RunRecord, result: Result) -> str:
-    excitation = recorded.recording.excitation
-    if excitation is None or not excitation.segments:
-        return with_code("this recording has no periodic excitation. Run tdhil identify with --excitation multisine, "
-                         "or describe the motion of a trace with --excitation", MessageCode.NO_EXCITATION.code)
-    found = result.identification
-    if found.periods_used and found.periods_used < 2 * len(excitation.segments):
-        return with_code(f"{found.periods_used} usable periods do not show the scatter. Run two whole periods or more "
-                         "at a mean speed (--periods)", MessageCode.TOO_FEW_PERIODS.code)
-    return with_code(f"{found.reason}. Advice: {found.advice}", found.entry.code)
+    excitation, found = result.record.recording.excitation, result.identification
+    if part["frequency_response"] is not None:
+        reason = None
+    elif excitation is None or not excitation.segments:
+        reason = with_code("this recording has no periodic excitation. Run tdhil identify with --excitation multisine, "
+                           "or describe the motion of a trace with --excitation", MessageCode.NO_EXCITATION.code)
+    elif found.periods_used and found.periods_used < 2 * len(excitation.segments):
+        reason = with_code(f"{found.periods_used} usable periods do not show the scatter. Run two whole periods or "
+                           "more at a mean speed (--periods)", MessageCode.TOO_FEW_PERIODS.code)
+    else:
+        reason = with_code(f"{found.reason}. Advice: {found.advice}", found.entry.code)
+    return part | {"reason": reason}
 
 
 def _write_picture(responses: Sequence[dict[str, Any]], path: Path) -> None:

@@ -90,7 +90,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     with sheltered():
         try:
-            code = _main(arguments, namespace)
+            # libraries log errors that tdhil reports itself, with place and next step
+            for library in (name for bus in BUSES.values() for name in bus.loggers):
+                logging.getLogger(library).addHandler(logging.NullHandler())
+                logging.getLogger(library).propagate = False
+            chosen = _chosen(arguments)
+            if chosen is not None and chosen == arguments[0] and chosen not in _COMMANDS:
+                from tdhil.cli.arguments import meant
+
+                raise UsageError(f"there is no command '{chosen[:40]}'", entry=MessageCode.UNKNOWN_COMMAND,
+                                 next_step=f"{meant(chosen, _COMMANDS)}See tdhil --help")
+            parser = build_parser(chosen)
+            parser.parse_args(arguments, namespace)
+            if namespace.command is None:
+                parser.print_help(sys.stderr)
+                code = 2
+            else:
+                code = int(namespace.run(namespace))
             sys.stdout.flush()
         except KeyboardInterrupt:
             _hear_no_more()
@@ -102,22 +118,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             # a syntax error gives no namespace, but a caller with --json still expects a document
             return _report(error, getattr(namespace, "json", None) is True or "--json" in arguments)
     return code
-
-
-def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
-    # libraries log errors that tdhil reports itself, with place and next step
-    for library in (name for bus in BUSES.values() for name in bus.loggers):
-        logging.getLogger(library).addHandler(logging.NullHandler())
-        logging.getLogger(library).propagate = False
-    chosen = _chosen(arguments)
-    if chosen is not None and chosen == arguments[0] and chosen not in _COMMANDS:
-        raise _no_command(chosen)
-    parser = build_parser(chosen)
-    parser.parse_args(arguments, namespace)
-    if namespace.command is None:
-        parser.print_help(sys.stderr)
-        return 2
-    return int(namespace.run(namespace))
 
 
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:
@@ -155,13 +155,6 @@ def _parser(chosen: Sequence[str]) -> argparse.ArgumentParser:
 
 def _chosen(arguments: Sequence[str]) -> str | None:
     return next((argument for argument in arguments if not argument.startswith("-")), None)
-
-
-def _no_command(name: str) -> UsageError:
-    from tdhil.cli.arguments import meant
-
-    return UsageError(f"there is no command '{name[:40]}'", next_step=f"{meant(name, _COMMANDS)}See tdhil --help",
-                      entry=MessageCode.UNKNOWN_COMMAND)
 
 
 _ELSEWHERE = {

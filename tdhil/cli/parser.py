@@ -58,23 +58,17 @@ class CommandParser(argparse.ArgumentParser):
         raise self._refusal(message, entry)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Refuse an unknown option in the parser that knows the options: argparse would leave it to the outermost
-        parser.
+        """Put the default action before words that begin with neither an action nor a help option. Refuse an unknown
+        option in the parser that knows the options: argparse would leave it to the outermost parser.
         """
-        found, unknown = super().parse_known_args(self._with_action(args), namespace)
+        if self.usual_action and args is not None:
+            actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
+            if not args or args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
+                args = [self.usual_action, *args]
+        found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             raise self._unknown(unknown)
         return found, unknown
-
-    def _with_action(self, args: Any) -> Any:
-        """Return the words with the default action before them, if the first word is neither an action nor a help
-        option.
-        """
-        if not self.usual_action or args is None:
-            return args
-        actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
-        known = {*actions.choices, "-h", "--help", HELP_ALL}
-        return args if args and args[0] in known else [self.usual_action, *args]
 
     def _unknown(self, words: list[str]) -> UsageError:
         from tdhil.cli.arguments import meant

@@ -58,7 +58,19 @@ def show(profile: Profile, console: Console) -> None:
     for name, entry in profile.entries():
         if name in sections:
             _section(name, entry, console)
-    _not_verified(profile, console)
+    found = doubtful(profile)
+    if not found:
+        console.print("Every entry is verified.")
+        return
+    table = _table("not verified: look these up in the drive's manual", "entry", "confidence", "claim", "source")
+    for name, entry in found:
+        claims = "; ".join(f"{key} {value}" for key, value, _ in facts_of(entry))
+        table.add_row(name, MARKS[entry.confidence], claims, entry.source)
+    console.print(table)
+    console.print(
+        f"A real drive is refused until you set 'confidence: verified' in a copy of the profile, or accept them as "
+        f"they are: {UNVERIFIED_FLAG} likely accepts all likely ones, {UNVERIFIED_FLAG} NAME one entry.", markup=False
+    )
 
 
 def _head(profile: Profile, console: Console) -> None:
@@ -113,22 +125,6 @@ def _section(name: str, entry: ProfileEntry, console: Console) -> None:
         table.add_row(key, value, said)
     if table.row_count:
         console.print(table)
-
-
-def _not_verified(profile: Profile, console: Console) -> None:
-    found = doubtful(profile)
-    if not found:
-        console.print("Every entry is verified.")
-        return
-    table = _table("not verified: look these up in the drive's manual", "entry", "confidence", "claim", "source")
-    for name, entry in found:
-        claims = "; ".join(f"{key} {value}" for key, value, _ in facts_of(entry))
-        table.add_row(name, MARKS[entry.confidence], claims, entry.source)
-    console.print(table)
-    console.print(
-        f"A real drive is refused until you set 'confidence: verified' in a copy of the profile, or accept them as "
-        f"they are: {UNVERIFIED_FLAG} likely accepts all likely ones, {UNVERIFIED_FLAG} NAME one entry.", markup=False
-    )
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -250,6 +246,8 @@ def _check(files: list[str], as_json: bool) -> int:
 
 
 def _import(file: str, output: str | None, as_json: bool) -> int:
+    import shlex
+
     from profiles import DataFileError, Problem, begin_profile, read_eds
 
     source = Path(file)
@@ -272,15 +270,10 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
     named = f"{begun.profile.name} on {begun.profile.bus}"
     print(f"{target}: {named}, created from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
     print(f"Look up in the drive's manual: {', '.join(open_entries)}. The file states what to look for.")  # noqa: T201
-    print(f"Then: tdhil profiles check {target}, and tdhil identify --simulate --profile {_as_path(target)}")  # noqa: T201
+    # --profile takes a bare name as a profile of the library: a file in this folder needs ./
+    path = shlex.quote(str(target) if target.parent.name or target.is_absolute() else f"./{target}")
+    print(f"Then: tdhil profiles check {target}, and tdhil identify --simulate --profile {path}")  # noqa: T201
     return 0
-
-
-def _as_path(target: Path) -> str:
-    """Return the path quoted for a shell, in a form that `--profile` takes as a file."""
-    import shlex
-
-    return shlex.quote(str(target) if target.parent.name or target.is_absolute() else f"./{target}")
 
 
 def _load(file: str) -> Profile:

@@ -63,7 +63,12 @@ def run(namespace: argparse.Namespace) -> int:
     check_trace(namespace)
     require_file(path)
     report = ReportFile.requested(namespace, path, letterhead=namespace.letterhead)
-    recorded = _expecting(namespace, read_recorded(namespace, path).with_said(_said(namespace)))
+    recorded = read_recorded(namespace, path).with_said(_said(namespace))
+    if namespace.expect:        # each expected value of the command line replaces that of the run
+        both = (*expectations_in(recorded.configuration), *expectations_of({}, namespace.expect))
+        found = {one.name: one for one in both}
+        recorded = replace(recorded, configuration={**recorded.configuration,
+                                                    "acceptance": [asdict(one) for one in found.values()]})
     if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
         return _evaluation(namespace, recorded, report)
     return _identify(namespace, recorded, report)
@@ -133,16 +138,6 @@ def _log(namespace: argparse.Namespace) -> Path:
                          entry=MessageCode.LOG_NEEDED)
     log: Path = namespace.log
     return log
-
-
-def _expecting(namespace: argparse.Namespace, recorded: RunRecord) -> RunRecord:
-    """Return the record with the expected values of the command line; each replaces that of the run."""
-    if not namespace.expect:
-        return recorded
-    both = (*expectations_in(recorded.configuration), *expectations_of({}, namespace.expect))
-    found = {one.name: one for one in both}
-    return replace(recorded, configuration={**recorded.configuration,
-                                            "acceptance": [asdict(one) for one in found.values()]})
 
 
 def _said(namespace: argparse.Namespace) -> dict[str, str]:

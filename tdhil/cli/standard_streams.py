@@ -76,7 +76,12 @@ def sheltered() -> Iterator[None]:
     Otherwise the next opened file, possibly the log, would get the number of a closed stdout or stderr. In stdout and
     stderr, a character that the stream cannot encode is replaced by a similar one.
     """
-    _fill_descriptors()
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)      # the lowest free number: that of this stream
     codecs.register_error(_HANDLER, _resembling)
     former = sys.stdout, sys.stderr
     err = sys.stderr if sys.stderr is not None else io.StringIO()
@@ -101,15 +106,6 @@ def forget(stream: TextIO) -> None:
         os.close(null)
     with suppress(OSError, ValueError):
         stream.flush()
-
-
-def _fill_descriptors() -> None:
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            with suppress(OSError):
-                os.open(os.devnull, os.O_RDWR)      # the lowest free number: that of this stream
 
 
 def _in_columns(text: str, encoding: str | None) -> str:

@@ -37,7 +37,7 @@ def run(namespace: argparse.Namespace) -> int:
 
     Ctrl-C ends only the observation. The stop request remains active.
     """
-    from drivers import MonotonicClock, bare_stop
+    from drivers import Ended, MonotonicClock, bare_stop
     from tdhil.buses import examples
     from tdhil.config import load_rig, resolve
     from tdhil.session import connection_of
@@ -63,7 +63,7 @@ def run(namespace: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(NOT_CONFIRMED, file=sys.stderr)  # noqa: T201
         raise
-    code = _exit_code(report)
+    code = ExitCode.OK if report.ended is Ended.AT_REST else ExitCode.STOP_NOT_CONFIRMED
     if namespace.json is True:
         print(json.dumps(_document(report, code), ensure_ascii=False, indent=2))  # noqa: T201
     else:
@@ -82,16 +82,6 @@ def _not_reached(error: Exception, *, as_json: bool) -> int:
     print(f"tdhil: {with_code(str(error), code_of(error))}", file=sys.stderr)  # noqa: T201
     print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
     return int(code)
-
-
-def _exit_code(report: BareStopReport) -> ExitCode:
-    from drivers import Ended
-
-    return {
-        Ended.AT_REST: ExitCode.OK,
-        Ended.TURNING: ExitCode.STOP_NOT_CONFIRMED,
-        Ended.NO_ANSWER: ExitCode.STOP_NOT_CONFIRMED,
-    }[report.ended]
 
 
 def said(report: BareStopReport) -> list[str]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sim_bus import RigParams
     from tdhil.config import Rig, RunOptions
     from tdhil.recording import Recording, Stage
-    from tdhil.runner import Idle, RunOutcome, Task
+    from tdhil.runner import Idle, Task
     from tdhil.runner.excitation import Plan, SpeedChangePlan
     from tdhil.studies import Chapter, FieldRun, RunProgress, Study, StudyOutcome
 
@@ -45,7 +45,7 @@ class SimulatedFieldBench:
         from tdhil.buses import PeerPlan
         from tdhil.config import resolve
         from tdhil.recording import RunLog, RunWriter
-        from tdhil.runner import Runner
+        from tdhil.runner import Runner, not_confirmed
         from tdhil.session import opened_drive, simulated_connection, stop_on_signals
 
         rig = bench_rig(wish)
@@ -62,7 +62,10 @@ class SimulatedFieldBench:
                     outcome = Runner(drive, make_task, log, stop_request, _ProgressDisplay(progress), _no_prompt).run()
             finally:
                 log.close()
-        _raise_if_ended(outcome)
+        if outcome.cause is not None:
+            raise outcome.cause
+        if outcome.stop is not None and not outcome.stop.confirmed:
+            raise not_confirmed(outcome.stop)
         return log.recording(complete=True)
 
 
@@ -122,15 +125,6 @@ def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
 def _no_prompt(task: Task, preflight: Preflight, idle: Idle) -> None:
     """Confirm: only simulated peers are opened here, so no real shaft moves."""
     assert preflight.identity.simulated
-
-
-def _raise_if_ended(outcome: RunOutcome) -> None:
-    from tdhil.runner import not_confirmed
-
-    if outcome.cause is not None:
-        raise outcome.cause
-    if outcome.stop is not None and not outcome.stop.confirmed:
-        raise not_confirmed(outcome.stop)
 
 
 class _ProgressDisplay:

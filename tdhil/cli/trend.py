@@ -51,6 +51,7 @@ def _add_output(parser: argparse.ArgumentParser, stated: str) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Read the table, and report changes."""
     from tdhil.fleet import counted, is_archived, read_table, trend_document
+    from tdhil.report import PlainConsole
 
     report = ReportFile.of_files(namespace, namespace.table)
     rows = read_table(namespace.table)
@@ -66,7 +67,14 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.json:
         print_json(document)
     else:
-        _print_trend(document)
+        console = PlainConsole()
+        stand = "stands" if document["results"] == 1 else "stand"
+        results, logs = counted(document["results"], "result"), counted(document["logs"], "log")
+        console.print(f"rig {document['rig']}{_marks(document)}: {results} that {stand}, of {logs}", soft_wrap=True)
+        for one in document["quantities"]:
+            console.print(_followed_text(one), soft_wrap=True)
+        for note in document["notes"]:
+            console.print(f"note: {note}", soft_wrap=True)
     if report is not None:
         report.write(_trend_report(document), ())
     return 0
@@ -109,20 +117,6 @@ def run_compare(namespace: argparse.Namespace) -> int:
 # Output on the terminal
 
 
-def _print_trend(document: Mapping[str, Any]) -> None:
-    from tdhil.fleet import counted
-    from tdhil.report import PlainConsole
-
-    console = PlainConsole()
-    stand = "stands" if document["results"] == 1 else "stand"
-    results, logs = counted(document["results"], "result"), counted(document["logs"], "log")
-    console.print(f"rig {document['rig']}{_marks(document)}: {results} that {stand}, of {logs}", soft_wrap=True)
-    for one in document["quantities"]:
-        console.print(_followed_text(one), soft_wrap=True)
-    for note in document["notes"]:
-        console.print(f"note: {note}", soft_wrap=True)
-
-
 def _followed_text(one: Mapping[str, Any]) -> str:
     """Return the trend of a quantity as text, after the least and the greatest of its values."""
     values = [point["value"] for point in one["points"]]
@@ -133,7 +127,7 @@ def _followed_text(one: Mapping[str, Any]) -> str:
 def _print_compared(document: Mapping[str, Any]) -> None:
     from rich.table import Table
 
-    from tdhil.report import PlainConsole
+    from tdhil.report import PlainConsole, rounded
 
     console = PlainConsole()
     if document["simulated"]:
@@ -147,7 +141,9 @@ def _print_compared(document: Mapping[str, Any]) -> None:
         table.add_row("≠" if one["differs"] else "", one["name"], *one["values"])
     table.add_section()
     table.add_row("", "verdict", *(one["verdict"] for one in document["results"]))
-    table.add_row("", "J, kg·m²", *(_inertia_text(one) for one in document["results"]))
+    inertias = ([one[f"inertia{part}_kg_m2"] for part in ("", "_low", "_high")] for one in document["results"])
+    table.add_row("", "J, kg·m²", *("–" if parts[0] is None else "{} ({} to {})".format(*rounded(*parts))
+                                   for parts in inertias))
     for hertz, values in _by_line(document).items():
         table.add_row("", f"apparent J, {hertz:.4g} Hz", *("–" if one is None else f"{one:#.4g}" for one in values))
     console.print(table)
@@ -170,13 +166,6 @@ def _headings(logs: Sequence[str]) -> Sequence[str]:
     """Return the file names; if two are the same, the given paths."""
     names = [Path(log).name for log in logs]
     return names if len(set(names)) == len(names) else logs
-
-
-def _inertia_text(row: Mapping[str, Any]) -> str:
-    from tdhil.report import rounded
-
-    value, low, high = (row[f"inertia{part}_kg_m2"] for part in ("", "_low", "_high"))
-    return "–" if value is None else "{} ({} to {})".format(*rounded(value, low, high))
 
 
 def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:

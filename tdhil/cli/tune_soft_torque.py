@@ -266,7 +266,7 @@ def _schedule(
 
 def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str]:
     """Return the case at the main shaft, and the source of the lags. Raises TuningRefused without J."""
-    from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused
+    from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused, with_noise
 
     measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
     advice = {} if not result.get("impedance") else {
@@ -278,7 +278,10 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     found = string_for(result, namespace, square**0.5)
     string = found.string
     if namespace.bit_noise is not None:
-        string = _with_measured_noise(string, namespace)
+        if string.bit is None:
+            raise UsageError("no bit is stated in string.yaml, so its random torque has no effect", where="--bit-noise",
+                             next_step="State bottom.coulomb_nm in string.yaml", entry=MessageCode.STRING_MISSING)
+        string = with_noise(string, *read_bit_noise(namespace.bit_noise))
     lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * estimated(result, "viscous_nm_s_rad"),
                      square**0.5 * estimated(result, "coulomb_nm"), lags)
@@ -311,16 +314,6 @@ def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> Requi
     period: Any = (result.get("cycle") or {}).get("period_s")
     control_s = float(period) if namespace.loop == "bus" and is_number(period) else CONTROL_PERIOD_S
     return RequiredMargins(dead_time_s=DEAD_TIME_PERIODS * control_s)
-
-
-def _with_measured_noise(string: DrillString, namespace: argparse.Namespace) -> DrillString:
-    """Return the string with the bit's random torque of the record. Raises UsageError without a bit."""
-    from tdhil.soft_torque import with_noise
-
-    if string.bit is None:
-        raise UsageError("no bit is stated in string.yaml, so its random torque has no effect", where="--bit-noise",
-                         next_step="State bottom.coulomb_nm in string.yaml", entry=MessageCode.STRING_MISSING)
-    return with_noise(string, *read_bit_noise(namespace.bit_noise))
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,17 @@ def lags_in(
         return Range(value, value * (1.0 - tolerance), value * (1.0 + tolerance))
 
     if measured is not None:
-        lags, dead, said = _lags_as_measured(measured), Range(0.0, 0.0, 0.0), "as measured (--impedance)"
+        # the sum of speed filter and torque lag is more certain than each, and determines the margins
+        ends = [ends_of(measured[key]) for key in ("speed_filter_s", "torque_lag_s")]
+        shares = [1.0, 1.0]
+        if isinstance(measured.get("inner_lag_s"), dict):
+            low, value, high = ends_of(measured["inner_lag_s"])
+            below, above = (sum(abs(one[end] - one[1]) for one in ends) for end in (0, 2))
+            shares = [min(1.0, (value - low) / below) if below else 1.0,
+                      min(1.0, (high - value) / above) if above else 1.0]
+        lags = tuple(Range(value, value - shares[0] * (value - low), value + shares[1] * (high - value))
+                     for low, value, high in ends)
+        dead, said = Range(0.0, 0.0, 0.0), "as measured (--impedance)"
     else:
         lags = tuple(open_by(lag, STATED_TOLERANCE) for lag in stated or ()) or tuple(
             open_by(lag, ASSUMED_TOLERANCE) for lag in ASSUMED_LAGS_S)
@@ -169,21 +179,6 @@ def lags_in(
                          next_step="State the filter of its speed, its torque loop and its sampling",
                          entry=MessageCode.LAGS_MISSING)
     return lags, dead, said
-
-
-def _lags_as_measured(measured: Mapping[str, Any]) -> tuple[Range, ...]:
-    """Return speed filter and torque lag. Their sum is more certain than each, and determines the margins."""
-    from tdhil.speed_loop import Range
-
-    ends = [ends_of(measured[key]) for key in ("speed_filter_s", "torque_lag_s")]
-    below, above = (sum(abs(one[end] - one[1]) for one in ends) for end in (0, 2))
-    if isinstance(measured.get("inner_lag_s"), dict):
-        low, value, high = ends_of(measured["inner_lag_s"])
-        shares = [min(1.0, (value - low) / below) if below else 1.0, min(1.0, (high - value) / above) if above else 1.0]
-    else:
-        shares = [1.0, 1.0]
-    return tuple(Range(value, value - shares[0] * (value - low), value + shares[1] * (high - value))
-                 for low, value, high in ends)
 
 
 def plant_of(result: Mapping[str, Any], lags: tuple[Range, ...], dead_time: Range, path: Path) -> UncertainPlant:
