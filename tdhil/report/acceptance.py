@@ -111,7 +111,13 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
 def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | None, float | None, float | None]:
     """Return value and interval. Those of J and friction include the torque scale; a read value, a limit, is exact."""
     part: Any
-    part, scale = document, _drive_scale(name, document)
+    part, scale, calibration = document, 1.0, document.get("torque_calibration")
+    if name in _SETTINGS and isinstance(calibration, Mapping):
+        # The torque limit is a setting of the drive or of rig.yaml, in the N·m of the drive. If a calibration was
+        # applied, the document has it in calibrated N·m, the scale in which saturation is judged. A correct setting
+        # must not fail by κ. The gains need no factor: no calibration is applied to a run that measures the drive's
+        # impedance.
+        scale = 1.0 / float(calibration["factor"])
     for key in at:
         part = part.get(key) if isinstance(part, Mapping) else None
     if isinstance(part, int | float) and not isinstance(part, bool):
@@ -123,20 +129,6 @@ def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | N
     if value is None or low is None or high is None:
         return value, low, high
     return scale * value, scale * low, scale * high
-
-
-def _drive_scale(name: str, document: Part) -> float:
-    """Return the factor from the document's scale to that of the expected value.
-
-    The torque limit is a setting of the drive or of rig.yaml, in the N·m of the drive. If a calibration was applied,
-    the document has it in calibrated N·m, the scale in which saturation is judged. A correct setting must not fail by
-    κ.
-    The gains need no factor: no calibration is applied to a run that measures the drive's impedance.
-    """
-    calibration = document.get("torque_calibration")
-    if name not in _SETTINGS or not isinstance(calibration, Mapping):
-        return 1.0
-    return 1.0 / float(calibration["factor"])
 
 
 def _other_scope(name: str, document: Part) -> str:
@@ -161,11 +153,14 @@ def _causes(rows: Sequence[Accepted]) -> Iterable[str]:
     failed = [one for one in rows if one.verdict is AcceptanceVerdict.FAIL and one.value is not None]
     named = {one.name for one in failed}
     ratios = {one.name: _ratio(one) for one in rows if one.name in _WITH_TORQUE and one.value is not None}
-    if len(ratios) == len(_WITH_TORQUE) and {"inertia", "coulomb"} <= named and _one_factor(list(ratios.values())):
-        factor = ratios["inertia"][0]
-        yield (f"everything that comes from the torque is {factor:.3g} times the expected value: another torque scale, "
-               "another rated torque, or another drive")
-        failed = [one for one in failed if one.name not in _WITH_TORQUE]
+    if len(ratios) == len(_WITH_TORQUE) and {"inertia", "coulomb"} <= named:
+        # equal within their intervals; a ratio with a very wide interval is no proof
+        (first, half), *others = ratios.values()
+        if all(abs(ratio - first) <= sqrt(width**2 + half**2) and width < abs(ratio - 1.0) + half
+               for ratio, width in others):
+            yield (f"everything that comes from the torque is {ratios['inertia'][0]:.3g} times the expected value: "
+                   "another torque scale, another rated torque, or another drive")
+            failed = [one for one in failed if one.name not in _WITH_TORQUE]
     for one in failed:
         assert one.value is not None
         ratio = f"{one.value / one.expected:.3g} times the expected value" if one.expected else f"{one.value:.3g}"
@@ -189,9 +184,3 @@ def _ratio(one: Accepted) -> tuple[float, float]:
     if not one.expected or one.value is None or one.low is None or one.high is None:
         return 0.0, float("inf")
     return one.value / one.expected, 0.5 * (one.high - one.low) / abs(one.expected)
-
-
-def _one_factor(ratios: Sequence[tuple[float, float]]) -> bool:
-    """Return whether all ratios are equal within their intervals; a ratio with a very wide interval is no proof."""
-    (first, half), *others = ratios
-    return all(abs(one - first) <= sqrt(width**2 + half**2) and width < abs(one - 1.0) + half for one, width in others)

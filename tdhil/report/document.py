@@ -139,7 +139,7 @@ def result_document(
     ``calibrated``: the torque calibration in the log, if there is one, was applied to ``recording``.
     Numbers that are not finite become null, because JSON has no NaN.
     """
-    found = identification
+    found, squared = identification, recording.gear_ratio * recording.gear_ratio
     document: dict[str, Any] = {
         "verdict": found.verdict.value,
         "model": found.model,
@@ -149,7 +149,9 @@ def result_document(
         "code": found.entry.code,
         "inertia_kg_m2": _inertia(found.inertia),
         "inertia_scope": None if (scope := scope_of(found, recording)) is None else scope.value,
-        "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),
+        "inertia_main_shaft_kg_m2": None if found.inertia is None else {     # J·i² with i = ω_motor/ω_main
+            name: getattr(found.inertia, name) * squared for name in ("value", "low_total", "high_total", "low", "high")
+        },
         "gear_ratio": recording.gear_ratio,
         "reference_inertia_kg_m2": run.get("reference_inertia_kg_m2"),
         "torque_limit_nm": recording.torque_limit_nm,
@@ -304,15 +306,6 @@ def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:
     repeatability = 0.5 * (inertia.high - inertia.low) / inertia.value
     first = {name: found.pop(name) for name in ("value", "low_total", "high_total")}
     return first | {"half_width_total_rel": total} | found | {"repeatability_rel": repeatability}
-
-
-def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[str, float] | None:
-    """Return J·i² with i = ω_motor/ω_main."""
-    if inertia is None:
-        return None
-    squared = gear_ratio * gear_ratio
-    names = ("value", "low_total", "high_total", "low", "high")
-    return {name: getattr(inertia, name) * squared for name in names}
 
 
 def _compliant(found: Identification) -> dict[str, Any] | None:

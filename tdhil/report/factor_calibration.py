@@ -171,7 +171,13 @@ def print_factor(document: Part, console: PlainConsole) -> None:
     body: list[Any] = [rows]
     shown = factor or document.get("measured_factor")
     if shown and document["budget"]:
-        body.append(_card_budget(document["budget"], shown["coverage_factor"]))
+        table = Grid.grid(padding=(0, 2))
+        table.add_column(style="dim")
+        table.add_column(justify="right", no_wrap=True)
+        table.add_row(Words("uncertainty budget", style="italic"), Words("± % of κ", style="dim"))
+        for line in sorted(document["budget"], key=lambda one: -one["of_factor"]):
+            table.add_row(line["source"], f"{100.0 * shown['coverage_factor'] * line['of_factor']:.3f}")
+        body.append(table)
     body.append(Words(sentence(document["reason"])))
     if document["advice"]:
         body.append(Words(sentence(document["advice"]), style="italic"))
@@ -182,16 +188,6 @@ def print_factor(document: Part, console: PlainConsole) -> None:
 
 _TITLES = {PAIRS: "torque calibration by pairs", REFERENCE: "torque calibration by a reference sensor",
            KNOWN_PIPE: "torque calibration by a known pipe"}
-
-
-def _card_budget(budget: Sequence[Part], k: float) -> Grid:
-    table = Grid.grid(padding=(0, 2))
-    table.add_column(style="dim")
-    table.add_column(justify="right", no_wrap=True)
-    table.add_row(Words("uncertainty budget", style="italic"), Words("± % of κ", style="dim"))
-    for line in sorted(budget, key=lambda one: -one["of_factor"]):
-        table.add_row(line["source"], f"{100.0 * k * line['of_factor']:.3f}")
-    return table
 
 
 def _interval(part: Part, unit: str) -> str:

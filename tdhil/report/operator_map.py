@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -63,21 +63,24 @@ def print_map(document: Part, console: PlainConsole) -> None:
 
 
 def _rows(document: Part) -> tuple[str, tuple[tuple[str, ...], ...]]:
-    """Return the title of the first column, and a row for each bit torque: the torque, then each controller."""
+    """Return the title of the first column, and a row for each bit torque: the torque, then each controller.
+
+    A controller's text: the speed from which the row is stable, and the speed up to which the bit sticks.
+    """
     weights = document.get("weights_on_bit_kn")
-    said = [f"{torque / 1e3:.2g} kN·m" + ("" if weights is None else f", {weights[k]:.3g} kN")
-            for k, torque in enumerate(document["bit_torques_nm"])]
-    rows = tuple((text, *(_row_words(states[k], document["speeds_rpm"]) for states in document["states"].values()))
-                 for k, text in enumerate(said))
-    return "bit torque" if weights is None else "bit torque, weight on bit", rows
-
-
-def _row_words(states: Sequence[str], speeds_rpm: Sequence[float]) -> str:
-    """Return a text: the speed from which the row is stable, and the speed up to which the bit sticks."""
-    stable = next((speed for k, speed in enumerate(speeds_rpm) if all(one == "stable" for one in states[k:])), None)
-    words = f"not stable up to {speeds_rpm[-1]:.0f} rpm" if stable is None else f"stable from {stable:.0f} rpm"
-    sticking = [speed for speed, one in zip(speeds_rpm, states, strict=True) if one == "stick-slip"]
-    return words + (f", stick-slip up to {sticking[-1]:.0f}" if sticking else "")
+    speeds_rpm, rows = document["speeds_rpm"], []
+    for k, torque in enumerate(document["bit_torques_nm"]):
+        cells = [f"{torque / 1e3:.2g} kN·m" + ("" if weights is None else f", {weights[k]:.3g} kN")]
+        for every in document["states"].values():
+            states = every[k]
+            stable = next((speed for at, speed in enumerate(speeds_rpm) if all(one == "stable" for one in states[at:])),
+                          None)
+            sticking = [speed for speed, one in zip(speeds_rpm, states, strict=True) if one == "stick-slip"]
+            cells.append((f"not stable up to {speeds_rpm[-1]:.0f} rpm" if stable is None
+                          else f"stable from {stable:.0f} rpm")
+                         + (f", stick-slip up to {sticking[-1]:.0f}" if sticking else ""))
+        rows.append(tuple(cells))
+    return "bit torque" if weights is None else "bit torque, weight on bit", tuple(rows)
 
 
 def draw_map(figure: FigureBase, document: Part) -> None:

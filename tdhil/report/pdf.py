@@ -37,7 +37,9 @@ def pdf_bytes(report: Report) -> bytes:
     from matplotlib.backends.backend_pdf import PdfPages
 
     data = BytesIO()
-    with _fonts(), PdfPages(data, metadata=_metadata(report)) as pages:
+    title = report.title + (f" ({report.simulated})" if report.simulated else "")
+    metadata = {"Title": title, "Subject": report.subtitle, "Creator": report.footer, "CreationDate": None}
+    with _fonts(), PdfPages(data, metadata=metadata) as pages:
         for figure in sheets_of(report):
             pages.savefig(figure)
     return data.getvalue()
@@ -49,14 +51,10 @@ def sheets_of(report: Report) -> list[Figure]:
     The pictures get the height that needs the fewest sheets, without a last sheet that is mostly empty.
     """
     with _fonts():
-        laid_out = [_laid_out(report, scale) for scale in _PICTURE_SCALES]
+        laid_out = [_Sheets(report.simulated, scale, _running_head(report)) for scale in _PICTURE_SCALES]
+        for sheets in laid_out:
+            _write(sheets, report)
         return min(laid_out, key=lambda one: one.emptiness).drawn(report.footer)
-
-
-def _laid_out(report: Report, scale: float) -> _Sheets:
-    sheets = _Sheets(report.simulated, scale, _running_head(report))
-    _write(sheets, report)
-    return sheets
 
 
 def _running_head(report: Report) -> str:
@@ -73,11 +71,6 @@ def _fonts() -> Iterator[None]:
     fonts: Any = {"pdf.fonttype": 42, "font.family": "DejaVu Sans", "font.size": SMALL, "axes.linewidth": 0.6}
     with repeatable_figures(), rc_context(fonts):
         yield
-
-
-def _metadata(report: Report) -> dict[str, Any]:
-    title = report.title + (f" ({report.simulated})" if report.simulated else "")
-    return {"Title": title, "Subject": report.subtitle, "Creator": report.footer, "CreationDate": None}
 
 
 _PICTURE_SCALES = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 1.05, 1.1, 1.15, 1.2)
@@ -153,7 +146,9 @@ class _Sheets:
             self._head(number)
             for at, draw in pieces:
                 draw(self, at)
-            self._foot(footer, f"page {number} of {len(self._pieces)}")
+            self.line(LEFT, HIGH - 26.0, footer, 6.8, color=_QUIET)
+            page = f"page {number} of {len(self._pieces)}"
+            self.line(WIDE - LEFT, HIGH - 26.0, page, 6.8, color=_QUIET, side="right")
             found.append(self.figure)
         return found
 
@@ -163,10 +158,6 @@ class _Sheets:
             self.line(LEFT + 6.0, TOP - 18.0 + 10.8, self._banner, SMALL, color="white", weight="bold")
         if number > 1:
             self.line(LEFT, TOP + (6.5 if self._banner else -4.0), self._running_head, 6.8, color=_QUIET)
-
-    def _foot(self, left: str, right: str) -> None:
-        self.line(LEFT, HIGH - 26.0, left, 6.8, color=_QUIET)
-        self.line(WIDE - LEFT, HIGH - 26.0, right, 6.8, color=_QUIET, side="right")
 
     # -- on the sheet that is drawn -----------------------------------------------------------------------------------
 

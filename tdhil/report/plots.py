@@ -11,7 +11,6 @@ import numpy as np
 from tdhil.recording import FloatArray, Recording
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import FigureBase
 
@@ -32,7 +31,15 @@ def draw_run(figure: FigureBase, recording: Recording) -> None:
         (speed_axes, recording.speed_rad_s, "speed, rad/s"),
         (torque_axes, recording.torque_nm, "torque, N·m"),
     ):
-        _shade(axes, recording)
+        for number, stage in enumerate(recording.stages):
+            if stage.end_s > stage.start_s:
+                axes.axvspan(stage.start_s, stage.end_s, color=_SHADES[number % 2], lw=0, zorder=0)
+        for segment in recording.excitation.segments if recording.excitation is not None else ():
+            settled = min(segment.start_s + segment.settle_periods * segment.period_s, segment.end_s)
+            axes.axvspan(segment.start_s, settled, color=_SEGMENT, alpha=0.08, lw=0, zorder=1)
+            axes.axvspan(settled, segment.end_s, color=_SEGMENT, alpha=0.20, lw=0, zorder=1)
+        for level in recording.levels:
+            axes.axvspan(level.start_s, level.end_s, color="#1a7f37", alpha=0.20, lw=0, zorder=1)
         time, low, high = envelope(recording.time_s, signal)
         axes.fill_between(time, low, high, color="0.15", lw=0.6, edgecolor="0.15", zorder=3)
         axes.set_ylabel(label)
@@ -53,19 +60,6 @@ def draw_run(figure: FigureBase, recording: Recording) -> None:
                 speed_axes.text(middle, height, stage.name, transform=speed_axes.get_xaxis_transform(), ha="center",
                                 va="bottom", fontsize="small")
     torque_axes.set_xlabel("time, s")
-
-
-def _shade(axes: Axes, recording: Recording) -> None:
-    for number, stage in enumerate(recording.stages):
-        if stage.end_s > stage.start_s:
-            axes.axvspan(stage.start_s, stage.end_s, color=_SHADES[number % 2], lw=0, zorder=0)
-    if recording.excitation is not None:
-        for segment in recording.excitation.segments:
-            settled = min(segment.start_s + segment.settle_periods * segment.period_s, segment.end_s)
-            axes.axvspan(segment.start_s, settled, color=_SEGMENT, alpha=0.08, lw=0, zorder=1)
-            axes.axvspan(settled, segment.end_s, color=_SEGMENT, alpha=0.20, lw=0, zorder=1)
-    for level in recording.levels:
-        axes.axvspan(level.start_s, level.end_s, color="#1a7f37", alpha=0.20, lw=0, zorder=1)
 
 
 def envelope(time_s: FloatArray, signal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -136,7 +136,10 @@ def schedule_section(document: Part) -> ReportSection:
     """Return table and figure of the schedule."""
     headings = _headings(document)
     rows = tuple(tuple(cell.replace("!", "⚠ ") for cell in cells) for cells in _table(document))
-    parameters = tuple(_parameter_rows(document))
+    parameters = tuple(
+        (f"{one['depth_m']:.0f}", setting["title"],
+         setting["why"] if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}")
+        for one in _with_gains(document) for setting in one["drive_parameters"])
     blocks: list[Table | Text | Picture] = [
         Table(tuple(Column(name, 1.0 / len(headings), number=True) for name in headings), rows),
         Text(document["sentence"]),
@@ -181,13 +184,6 @@ def _table(document: Part) -> Iterator[list[str]]:
         yield cells
 
 
-def _parameter_rows(document: Part) -> Iterator[tuple[str, ...]]:
-    for one in _with_gains(document):
-        for setting in one["drive_parameters"]:
-            value = setting["why"] if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
-            yield f"{one['depth_m']:.0f}", setting["title"], value
-
-
 def draw_schedule(figure: FigureBase, document: Part) -> None:
     """Draw P and I over depth; below, the critical speed of these gains and of those for comparison."""
     rows, between = _with_gains(document), document["between"]
@@ -203,24 +199,21 @@ def draw_schedule(figure: FigureBase, document: Part) -> None:
     axes.set_ylabel("at the motor")
     plain_ticks(axes.yaxis)
     if noisy:
-        _draw_speeds(every[1], document)
+        axes = every[1]
+        for key, name, colour in (("compared_critical_rpm", document["compared_with"], "0.35"),
+                                  ("critical_under_noise_rpm", document["kind"], "#1f5fa8")):
+            parts = [(one["depth_m"], one[key]) for one in rows if one.get(key)]
+            found = [(depth, part) for depth, part in parts if part["value"] is not None]
+            depths = [depth for depth, _ in found]
+            axes.plot(depths, [part["value"] for _, part in found], "o-", ms=3, color=colour, label=name)
+            axes.fill_between(depths, [part["low"] for _, part in found],
+                              [part["high"] or HIGHEST_NOISY_RPM for _, part in found], color=colour, alpha=0.15, lw=0)
+        crosses = [(one["depth_m"], one["critical_under_noise_rpm"]) for one in between]
+        known = [(depth, part["value"]) for depth, part in crosses if part and part["value"] is not None]
+        axes.plot([depth for depth, _ in known], [value for _, value in known], "x", ms=4, color="#1f5fa8")
+        axes.set_ylabel("critical speed, rpm")
+        axes.set_ylim(bottom=0.0)
     for one in every:
         one.grid(alpha=0.3)
         one.legend(fontsize="small")
     every[-1].set_xlabel("depth, m")
-
-
-def _draw_speeds(axes: Any, document: Part) -> None:
-    for key, name, colour in (("compared_critical_rpm", document["compared_with"], "0.35"),
-                              ("critical_under_noise_rpm", document["kind"], "#1f5fa8")):
-        parts = [(one["depth_m"], one[key]) for one in _with_gains(document) if one.get(key)]
-        found = [(depth, part) for depth, part in parts if part["value"] is not None]
-        depths = [depth for depth, _ in found]
-        axes.plot(depths, [part["value"] for _, part in found], "o-", ms=3, color=colour, label=name)
-        axes.fill_between(depths, [part["low"] for _, part in found],
-                          [part["high"] or HIGHEST_NOISY_RPM for _, part in found], color=colour, alpha=0.15, lw=0)
-    crosses = [(one["depth_m"], one["critical_under_noise_rpm"]) for one in document["between"]]
-    known = [(depth, part["value"]) for depth, part in crosses if part and part["value"] is not None]
-    axes.plot([depth for depth, _ in known], [value for _, value in known], "x", ms=4, color="#1f5fa8")
-    axes.set_ylabel("critical speed, rpm")
-    axes.set_ylim(bottom=0.0)

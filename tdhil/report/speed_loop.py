@@ -310,9 +310,12 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     yield "P, N·m·s/rad", [gain_words(one["gain_nm_s_rad"]) for one in every]
     yield "I, N·m/rad", [gain_words(one["integral_nm_rad"]) for one in every]
     yield "T_I = P/I, s", [gain_words(one["integral_time_s"]) for one in every]
-    if any(one["notch"] for one in every):
-        yield "notch, Hz; dampings", [_notch(one["notch"]) for one in every]
-        yield "notch: width, Hz; depth, dB", [_notch_shape(one["notch"]) for one in every]
+    notches = [one["notch"] for one in every]
+    if any(notches):
+        yield "notch, Hz; dampings", ["–" if one is None else f"{one['hertz']:.3g}; {one['numerator_damping']:g} / "
+                                      f"{one['denominator_damping']:g}" for one in notches]
+        yield "notch: width, Hz; depth, dB", ["–" if one is None else "; ".join(
+            "–" if one[key] is None else f"{one[key]:.3g}" for key in ("width_hz", "depth_db")) for one in notches]
     limits = document["required"]
     for name, key, digits, unit in (("phase margin", "phase_deg", 0, "°"), ("gain margin", "gain_db", 1, " dB")):
         yield f"{name}, best estimate", [_margin(one["as_believed"], key, digits, unit) for one in every]
@@ -330,16 +333,6 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
 def _margin(part: Part, key: str, digits: int, unit: str) -> str:
     return f"{_number(part[key], digits)}{unit}" if part["stable"] and part[key] is not None else (
         "no limit" if part["stable"] else "unstable")
-
-
-def _notch(part: Part | None) -> str:
-    return "–" if part is None else (f"{part['hertz']:.3g}; {part['numerator_damping']:g} / "
-                                     f"{part['denominator_damping']:g}")
-
-
-def _notch_shape(part: Part | None) -> str:
-    return "–" if part is None else "; ".join(
-        "–" if value is None else f"{value:.3g}" for value in (part["width_hz"], part["depth_db"]))
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -145,8 +145,11 @@ def calibration_report(document: Part) -> Report:
 def _sections(document: Part) -> Iterator[ReportSection]:
     yield calibrated_item(document)
     yield ReportSection("Method", (Text(_METHOD),))
-    if document["calibration_factor"] is not None:
-        yield ReportSection("Result", (_results(document), Text(_result_note(document))))
+    if (factor := document["calibration_factor"]) is not None:
+        yield ReportSection("Result", (_results(document), Text(
+            "The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"
+            f" probability of {100 * factor['confidence']:g} %. Of a calibrated torque, the share that comes from the"
+            " unit of speed is part of κ: κ is right for inertia and for torque over acceleration.")))
         yield ReportSection("Uncertainty budget", (_factor_budget(document), Text(_BUDGET_NOTE)))
     if document["line"] is not None:
         yield ReportSection("Identified over known inertia", (_picture(document), _data(document)))
@@ -166,13 +169,6 @@ _BUDGET_NOTE = (
     " coefficient of κ and of J, % per kg·m²; c·u: contribution to the relative standard uncertainty, %. “Filters of"
     " the reports” acts on all runs together: its c is effective."
 )
-
-
-def _result_note(document: Part) -> str:
-    factor = document["calibration_factor"]
-    return (f"The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"
-            f" probability of {100 * factor['confidence']:g} %. Of a calibrated torque, the share that comes from the"
-            " unit of speed is part of κ: κ is right for inertia and for torque over acceleration.")
 
 
 def _results(document: Part) -> Table:

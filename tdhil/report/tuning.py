@@ -31,7 +31,6 @@ from tdhil.soft_torque import (
     Interval,
     SimulationTrace,
     SpeedController,
-    TuneCase,
     Tuned,
     Tuning,
     in_squares,
@@ -107,6 +106,8 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     hertz = np.round(np.geomspace(0.02, 2.0, 160), 5)
     taken = [one for one in tuning.tuned if one.controller is not None]
     search = tuning.searched
+    lag_s = case.drive.total_lag_s
+    lags_moved = [[end.drive.total_lag_s for end in pair] for pair in case.moves(present=False)]
     return {
         "tuned_for": {
             "source": tuned_for.source, "simulated": tuned_for.simulated, "profile": tuned_for.profile,
@@ -119,7 +120,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             "coulomb_nm": case.drive.coulomb_nm,
             "inner_lags_s": list(case.drive.inner_lags_s),
             "inner_lags_from": tuned_for.lags_from,
-            "inner_lag_s": asdict(_whole_lag(case)),
+            "inner_lag_s": asdict(in_squares(Interval(lag_s, lag_s, lag_s), lags_moved)),
         },
         "string": {
             "name": string.name,
@@ -154,13 +155,6 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
         "warnings": [*tuned_for.warnings, *_sends_back_more(tuning)],
         "tdhil": __version__,
     }
-
-
-def _whole_lag(case: TuneCase) -> Interval:
-    """Return Στ with its interval."""
-    value = case.drive.total_lag_s
-    moved = [[end.drive.total_lag_s for end in pair] for pair in case.moves(present=False)]
-    return in_squares(Interval(value, value, value), moved)
 
 
 def _sends_back_more(tuning: Tuning) -> Iterator[str]:
@@ -246,7 +240,14 @@ def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
     assert base is not None
     what = "the present gains" if base.kind == "present" else "a stiff speed loop"
     if best is None and not tuning.advice.keep:
-        return _not_compared(tuning, base, what)
+        why, needed = ("no bit is stated", "State bottom.coulomb_nm in string.yaml (--string) to compare them.")
+        if tuning.case.string.bit is not None:
+            why, needed = "--no-simulation omits them", "Leave --no-simulation out to compare them."
+        head = f"No gains are recommended: the critical speeds were not compared, because {why}. {needed}"
+        soft = tuning.by_kind("soft")
+        if soft is None or soft.controller is None:
+            return head
+        return f"{head} Soft gains, compared with {what}: {_changes(base, soft)}."
     if best is None:
         offered = any(one.controller is not None and not one.failed for one in tuning.tuned if one is not base)
         head = ("Keep what you have: " if base.kind == "present" else "Keep a stiff speed loop: ")
@@ -255,18 +256,6 @@ def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
         speed = "" if base.cure is None else f" of {_rpm_words(base.cure)}"
         return head + f"no other controller lowers the critical speed{speed} by more than the search resolves."
     return f"Type in the {best.kind} gains. Compared with {what}: {_changes(base, best)}."
-
-
-def _not_compared(tuning: Tuning, base: Tuned, what: str) -> str:
-    """Return the sentence without critical speeds: what is missing, and what the soft row changes."""
-    why, needed = ("no bit is stated", "State bottom.coulomb_nm in string.yaml (--string) to compare them.")
-    if tuning.case.string.bit is not None:
-        why, needed = "--no-simulation omits them", "Leave --no-simulation out to compare them."
-    head = f"No gains are recommended: the critical speeds were not compared, because {why}. {needed}"
-    soft = tuning.by_kind("soft")
-    if soft is None or soft.controller is None:
-        return head
-    return f"{head} Soft gains, compared with {what}: {_changes(base, soft)}."
 
 
 def _changes(base: Tuned, best: Tuned) -> str:
