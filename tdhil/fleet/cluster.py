@@ -62,7 +62,12 @@ def run_on_cluster(
     """Yield every task with its result, as `Pool.run` does. Raises UsageError before the start if the scheduler can't
     be reached or its workers don't fit, and TdhilError if all workers have gone.
     """
-    distributed = _distributed()
+    try:
+        distributed = importlib.import_module("distributed")
+    except ImportError as error:
+        raise UsageError("distributed is not installed", where="--scheduler",
+                         next_step="Install it with: pip install '.[cluster]'",
+                         entry=MessageCode.PACKAGE_MISSING) from error
     try:
         client = distributed.Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
@@ -156,12 +161,3 @@ def _check(client: Any, address: str) -> int:
                              next_step="Rows would depend on the worker: install the same versions",
                              entry=MessageCode.CLUSTER_UNUSABLE)
     return int(sum(client.nthreads().values()))
-
-
-def _distributed() -> Any:
-    try:
-        return importlib.import_module("distributed")
-    except ImportError as error:
-        raise UsageError("distributed is not installed", where="--scheduler",
-                         next_step="Install it with: pip install '.[cluster]'",
-                         entry=MessageCode.PACKAGE_MISSING) from error

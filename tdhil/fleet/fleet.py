@@ -292,7 +292,13 @@ def find_logs(roots: Sequence[str], *, archived: bool = True) -> FoundLogs:
     bare: set[str] = set()
     for root in roots:
         if "://" in root:
-            logs.update(_remote(root))
+            system, inside = remote(root)
+            try:
+                with named_errors(root):
+                    names = [inside] if system.isfile(inside) else system.find(inside)
+            except (OSError, LogError) as error:
+                raise UsageError(f"can't be listed: {error}", where=root) from error
+            logs.update(system.unstrip_protocol(name) for name in names if name.lower().endswith(".mcap"))
             continue
         path = Path(root)
         if path.is_file():
@@ -332,14 +338,3 @@ def _sort_in(path: Path, logs: set[str], live: set[str], bare: set[str], *, name
         live.add(str(path))
     else:
         logs.add(str(path))
-
-
-def _remote(root: str) -> list[str]:
-    """Return the logs below a URL that fsspec can list."""
-    system, inside = remote(root)
-    try:
-        with named_errors(root):
-            names = [inside] if system.isfile(inside) else system.find(inside)
-    except (OSError, LogError) as error:
-        raise UsageError(f"can't be listed: {error}", where=root) from error
-    return [system.unstrip_protocol(name) for name in names if name.lower().endswith(".mcap")]

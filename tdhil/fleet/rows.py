@@ -207,14 +207,18 @@ def row_of(
     if isinstance(calibration, Mapping):
         facts |= {"torque_calibration": calibration.get("date"), "torque_scale_rel_sd": calibration.get("rel_sd")}
     was = _stored(stored)
-    now = (document["verdict"], found["inertia_kg_m2"])
+    verdict, value = document["verdict"], found["inertia_kg_m2"]
+    changed = None
+    if was:         # the verdict, or the number by more than the rounding of another processor
+        changed = was[0] != verdict or (was[1] is None) != (value is None) or (
+            was[1] is not None and not math.isclose(was[1], value, rel_tol=1e-8))
     known: dict[str, Any] = found | facts | {
         "stored_verdict": was[0] if was else None,
         "stored_inertia_kg_m2": was[1] if was else None,
-        "changed": _differs(was, now) if was else None,
+        "changed": changed,
     }
     return row_from_json(
-        {"log": log, "verdict": document["verdict"], "settings": json.dumps(settings.asked(), sort_keys=True)} | known
+        {"log": log, "verdict": verdict, "settings": json.dumps(settings.asked(), sort_keys=True)} | known
     )
 
 
@@ -251,10 +255,3 @@ def _stored(document: Mapping[str, Any] | None) -> tuple[str, float | None] | No
     value = inertia.get("value") if isinstance(inertia, Mapping) else None
     number = float(value) if isinstance(value, int | float) and math.isfinite(value) else None
     return document["verdict"][:40], number
-
-
-def _differs(was: tuple[str, float | None], now: tuple[str, float | None]) -> bool:
-    """Return whether the verdict differs, or the number by more than the rounding of another processor."""
-    if was[0] != now[0] or (was[1] is None) != (now[1] is None):
-        return True
-    return was[1] is not None and now[1] is not None and not math.isclose(was[1], now[1], rel_tol=1e-8)

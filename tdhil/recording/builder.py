@@ -49,23 +49,20 @@ def plain(value: Any) -> Any:
 
 
 def _dataclass(kind: Any, value: Any) -> Any:
-    hints = hints_of(kind)
-    known = {}
-    for field in fields(kind):
-        found, member = _member(value, field.name, hints[field.name])
-        if found:
-            known[field.name] = structure(hints[field.name], member)
+    hints, known = hints_of(kind), {}
+    for name in (field.name for field in fields(kind)):
+        if isinstance(value, dict):
+            if name not in value:
+                continue
+            member = value[name]
+        elif not hasattr(value, name):
+            continue
+        elif get_origin(hints[name]) is UnionType and hasattr(value, "HasField") and not value.HasField(name):
+            member = None
+        else:
+            member = getattr(value, name)
+        known[name] = structure(hints[name], member)
     return kind(**known)
-
-
-def _member(value: Any, name: str, hint: Any) -> tuple[bool, Any]:
-    if isinstance(value, dict):
-        return name in value, value.get(name)
-    if not hasattr(value, name):
-        return False, None
-    if get_origin(hint) is UnionType and hasattr(value, "HasField") and not value.HasField(name):
-        return True, None
-    return True, getattr(value, name)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -220,7 +217,8 @@ class RecordingBuilder:
         flags = np.frombuffer(bytes(self._flags), dtype=np.uint8)
         setpoints = np.array(self._setpoints, dtype=np.float64).reshape(-1, 2)
         time_s, speed_rad_s, torque_nm = (np.ascontiguousarray(values[:, column]) for column in range(3))
-        commanded_nm, demanded_nm = (_where_known(setpoints[:, column]) for column in range(2))
+        commanded_nm, demanded_nm = (       # None: no value at all
+            None if np.all(np.isnan(signal)) else np.ascontiguousarray(signal) for signal in setpoints.T)
         position_rad = None
         if self._positions_at:
             position_rad = np.full(len(flags), np.nan)
@@ -241,8 +239,3 @@ class RecordingBuilder:
             position_rad=position_rad,
             **self._facts,
         )
-
-
-def _where_known(signal: FloatArray) -> FloatArray | None:
-    """Return the signal, or None if it has no value at all."""
-    return None if bool(np.all(np.isnan(signal))) else np.ascontiguousarray(signal)

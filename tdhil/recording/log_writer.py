@@ -252,38 +252,32 @@ class Pump:
                 if len(self._frames) >= FRAMES:
                     self._put_frames()
             elif kind is Sample:
-                self._put_sample(item)
+                if self._frames:
+                    self._put_frames()
+                log_ns = self._log_ns(item[0])
+                self._container.add(SAMPLE, log_ns, pack_sample(item))
+                if self._chunk_ns is None:
+                    self._chunk_ns = log_ns
+                elif not 0 <= log_ns - self._chunk_ns < CHUNK_LOG_NS:
+                    self._close_chunk()
             elif kind is Cold:
-                self._put_cold(item)
+                channel, time_s, payload, flush = item
+                log_ns = self._log_ns(self._time_s if time_s is None else time_s)
+                if channel == LOG:
+                    payload = log_payload(REHEARSAL, payload.decode(), log_ns)
+                self._container.add(channel, log_ns, payload)
+                if channel == EVENT:
+                    self._put_log(log_ns, payload)
+                if flush or self._container.size > CHUNK_BYTES:
+                    self._close_chunk()
             else:
                 time_s, command = item
                 self._container.add(COMMAND, self._log_ns(time_s), pack_command(time_s, command))
-
-    def _put_sample(self, sample: Sample) -> None:
-        if self._frames:
-            self._put_frames()
-        log_ns = self._log_ns(sample[0])
-        self._container.add(SAMPLE, log_ns, pack_sample(sample))
-        if self._chunk_ns is None:
-            self._chunk_ns = log_ns
-        elif not 0 <= log_ns - self._chunk_ns < CHUNK_LOG_NS:
-            self._close_chunk()
 
     def _put_frames(self) -> None:
         frames, self._frames = self._frames, []
         self._container.add(self._channel, self._log_ns(frames[0][0]), pack_frames(frames))
         if self._container.size > CHUNK_BYTES:
-            self._close_chunk()
-
-    def _put_cold(self, cold: Cold) -> None:
-        channel, time_s, payload, flush = cold
-        log_ns = self._log_ns(self._time_s if time_s is None else time_s)
-        if channel == LOG:
-            payload = log_payload(REHEARSAL, payload.decode(), log_ns)
-        self._container.add(channel, log_ns, payload)
-        if channel == EVENT:
-            self._put_log(log_ns, payload)
-        if flush or self._container.size > CHUNK_BYTES:
             self._close_chunk()
 
     def _put_log(self, log_ns: int, payload: bytes) -> None:

@@ -126,10 +126,16 @@ class Container:
         end = _record(DataEnd(0))
         start = self._offset + len(end)
         schemas, channels = self._declarations
+        statistics = Statistics(
+            attachment_count=0, metadata_count=0, channel_count=len(CHANNELS), schema_count=len(CHANNELS),
+            chunk_count=len(self._chunks), message_count=sum(self._counts.values()),
+            channel_message_counts={channel: count for channel, count in self._counts.items() if count},
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0))
         groups: list[tuple[Opcode, list[bytes]]] = [
             (Opcode.SCHEMA, schemas),
             (Opcode.CHANNEL, channels),
-            (Opcode.STATISTICS, [_record(self._statistics())]),
+            (Opcode.STATISTICS, [_record(statistics)]),
             (Opcode.CHUNK_INDEX, [_record(chunk) for chunk in self._chunks]),
         ]
         summary, pointers = b"", b""
@@ -187,14 +193,6 @@ class Container:
                 f"the file was cut to less than {start + len(before)} of {self._offset} bytes"
                 " while it was being written",
             )
-
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=0, metadata_count=0, channel_count=len(CHANNELS), schema_count=len(CHANNELS),
-            chunk_count=len(self._chunks), message_count=sum(self._counts.values()),
-            channel_message_counts={channel: count for channel, count in self._counts.items() if count},
-            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
-            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0))
 
 
 def _is_named(file: RawFile) -> bool:

@@ -84,13 +84,27 @@ def chunk_head(file: BinaryIO, offset: int, size: int) -> ChunkHead | None:
 
 
 def contents(file: BinaryIO, offset: int, chunk: ChunkHead, zstd: zstandard.ZstdDecompressor) -> Contents | Damage:
-    """Return the chunk with the head read at ``offset``, decompressed and checked. ``zstd`` limits the window."""
+    """Return the chunk with the head read at ``offset``, decompressed and checked. ``zstd`` limits the window.
+
+    No more memory is used than for one byte above the stated size.
+    """
     if chunk.uncompressed_size > CHUNK_LIMIT or chunk.length > CHUNK_LIMIT:
         return Damage(offset, f"a chunk of {max(chunk.uncompressed_size, chunk.length)} bytes is refused "
                                f"(limit {CHUNK_LIMIT})")
     data = read_at(file, chunk.start, chunk.length)
+    limit = chunk.uncompressed_size + 1
     try:
-        inflated = _decompress(zstd, chunk.compression, data, chunk.uncompressed_size + 1)
+        if chunk.compression == "zstd" and 0 <= zstandard.frame_content_size(data) < limit:
+            inflated = zstd.decompress(data)        # memory is reserved for the size that the frame states
+        elif chunk.compression == "zstd":
+            with zstd.stream_reader(data) as reader:
+                inflated = reader.read(limit)
+        elif chunk.compression == "lz4":
+            inflated = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))
+        elif chunk.compression == "":
+            inflated = data[:limit]
+        else:
+            raise ValueError(f"unknown compression {chunk.compression!r}")
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
         return Damage(offset, f"a chunk can't be decompressed: {' '.join(str(error).split())}")
     if len(inflated) != chunk.uncompressed_size:
@@ -98,20 +112,6 @@ def contents(file: BinaryIO, offset: int, chunk: ChunkHead, zstd: zstandard.Zstd
     if chunk.crc and crc32(inflated) != chunk.crc:
         return Damage(offset, "a chunk is damaged: its CRC is wrong")
     return Contents(offset, inflated)
-
-
-def _decompress(zstd: zstandard.ZstdDecompressor, compression: str, data: bytes, limit: int) -> bytes:
-    """Return at most ``limit`` decompressed bytes, and never use more memory than that."""
-    if compression == "zstd":
-        if 0 <= zstandard.frame_content_size(data) < limit:     # memory is reserved for the stated size only
-            return zstd.decompress(data)
-        with zstd.stream_reader(data) as reader:
-            return reader.read(limit)
-    if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))
-    if compression == "":
-        return data[:limit]
-    raise ValueError(f"unknown compression {compression!r}")
 
 
 def read_at(file: BinaryIO, offset: int, length: int) -> bytes:
@@ -157,14 +157,17 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
         head = read_at(file, offset, _INDEX_HEAD)
         opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
         end = offset + _RECORD.size + length
-        if opcode == MESSAGE_INDEX and end <= size and _is_index(head, length):
+        if (opcode == MESSAGE_INDEX and end <= size and len(head) == _INDEX_HEAD
+                and int.from_bytes(head[-4:], "little") + 6 == length):     # its two lengths agree
             offset = end                    # most records are of this kind
             continue
         if not head:
             yield Damage(offset, "the file ends in mid-run: it was not closed")
             return
         if opcode == DATA_END and length == 4:
-            yield Whole() if _is_closed(file, size) else Damage(offset, "the index at the end is cut or damaged")
+            tail = read_at(file, size - len(MAGIC) - 20 - len(_FOOTER), len(_FOOTER) + 20 + len(MAGIC))
+            closed = tail.startswith(_FOOTER) and tail.endswith(MAGIC)
+            yield Whole() if closed else Damage(offset, "the index at the end is cut or damaged")
             return
         if opcode == CHUNK and (chunk := chunk_head(file, offset, size)):
             found = contents(file, offset, chunk, zstd)
@@ -188,11 +191,6 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
                 return
             end = found_at
         offset = end
-
-
-def _is_index(head: bytes, length: int) -> bool:
-    """Return whether this is the head of a message index whose two lengths agree."""
-    return len(head) == _INDEX_HEAD and int.from_bytes(head[-4:], "little") + 6 == length
 
 
 def _is_added(file: BinaryIO, opcode: int, start: int, end: int) -> bool:
@@ -221,11 +219,6 @@ def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
                 return offset + match.start() - before
         offset += _STEP
     return None
-
-
-def _is_closed(file: BinaryIO, size: int) -> bool:
-    tail = read_at(file, size - len(MAGIC) - 20 - len(_FOOTER), len(_FOOTER) + 20 + len(MAGIC))
-    return tail.startswith(_FOOTER) and tail.endswith(MAGIC)
 
 
 def _library(body: bytes) -> str:

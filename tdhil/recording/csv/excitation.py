@@ -153,7 +153,9 @@ def motion_of(given: Mapping[str, Any]) -> tuple[dict[str, Any] | None, list[tup
     except ValidationError as error:
         wrong: dict[str, str] = {}
         for path, message in messages_of(error, json.loads(json.dumps(content)), ExcitationFile):
-            wrong.setdefault(_option_at(path), message)
+            # the option whose place is the beginning of this path
+            option = next((name for name, place in _KEYS.items() if path[: len(place)] == place), "motion_start_s")
+            wrong.setdefault(option, message)
         return None, list(wrong.items())
     return content, []
 
@@ -167,11 +169,6 @@ def _hertz(text: str) -> tuple[float | str, ...]:
         except ValueError:
             found.append(part)
     return tuple(found)
-
-
-def _option_at(path: tuple[str | int, ...]) -> str:
-    """Return the option whose place is the beginning of this path."""
-    return next((name for name, key in _KEYS.items() if path[: len(key)] == key), "motion_start_s")
 
 
 def load_excitation(

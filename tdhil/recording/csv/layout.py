@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 
 from profiles import quantities
 from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, shown
@@ -153,7 +153,8 @@ def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, 
     ``flag``: the option that contains the choices.
     """
     found: dict[str, ColumnChoice] = {}
-    such_as = _such_as(quantities, flag)
+    example = {"time": "time=t_s", "speed": "speed=n_rpm:rpm", "torque": "torque=m:Nm"}
+    such_as = f"Such as: {flag} {' '.join(example[quantity] for quantity in quantities)}"
     for item in items:
         quantity, equals, name = item.partition("=")
         quantity = quantity.strip().casefold()
@@ -173,11 +174,6 @@ def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, 
         raise UsageError("one column can't hold two quantities", where=flag, next_step=such_as,
                          entry=MessageCode.CSV_COLUMNS_UNCLEAR)
     return tuple(found.get(quantity, ColumnChoice(quantity)) for quantity in quantities)
-
-
-def _such_as(quantities: Sequence[str], flag: str) -> str:
-    example = {"time": "time=t_s", "speed": "speed=n_rpm:rpm", "torque": "torque=m:Nm"}
-    return f"Such as: {flag} {' '.join(example[quantity] for quantity in quantities)}"
 
 
 def _choice(quantity: str, text: str, flag: str) -> ColumnChoice:
@@ -358,7 +354,10 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
         (row for at, row in rows.items() if at < first and _states_units(quantities, row)), [""] * len(choices)
     )
     clock = ":" in rows[first][0]
-    seen = [_wanted(line, header) for line in _telling(lines[first:], header.delimiter)]
+    # the first lines, and some later ones with a comma if it is no separator: at standstill all values are 0
+    later = (line for line in lines[first + _LOOKED_AT:] if "," in line) if header.delimiter != "," else ()
+    seen = [_wanted(line, header)
+            for line in chain(lines[first:first + _LOOKED_AT], islice(later, _LOOKED_AT))]
     sign = decimal_sign(row[1:] if clock else row for row in seen)
     if sign == "?":
         raise CsvUnusable(
@@ -383,14 +382,6 @@ def _states_units(quantities: Sequence[str], row: Sequence[str]) -> bool:
     """Return whether a row below the header is a row of units: one is known, or all are in brackets."""
     return any(map(unit_of, quantities, row)) or all(
         (found := _BRACKETED.match(cell.strip())) is not None and not found.group(1) for cell in row)
-
-
-def _telling(lines: Sequence[str], delimiter: str) -> list[str]:
-    """Return the first lines, and some later ones with a comma if it is no separator: at standstill all values are
-    0.
-    """
-    further = (line for line in lines[_LOOKED_AT:] if "," in line) if delimiter != "," else ()
-    return [*lines[:_LOOKED_AT], *islice(further, _LOOKED_AT)]
 
 
 def _wanted(line: str, header: Header) -> list[str]:

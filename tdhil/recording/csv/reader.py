@@ -98,16 +98,13 @@ class RowReader:
             return None
         if len(values) != len(lines):
             return None
-        return values if self._clock is None else self._timed(lines, values)
-
-    def _timed(self, lines: list[str], values: FloatArray) -> FloatArray | None:
-        """Return the block's clock times with its values; None, with the clock unchanged, if one cannot be read."""
-        assert self._clock is not None
+        if self._clock is None:
+            return values
         before = copy(self._clock)
         column, seconds = self._columns[0], self._clock.seconds
-        times = [seconds(line.split(self._delimiter, column + 1)[column].strip()) for line in lines]
+        times = [seconds(line.split(delimiter, column + 1)[column].strip()) for line in lines]
         if None in times:
-            self._clock = before
+            self._clock = before        # unchanged if one time cannot be read
             return None
         return np.column_stack([np.array(times, dtype=np.float64), values])
 

@@ -88,10 +88,18 @@ def survey_trace(path: Path) -> TraceSurvey:
     names = header.names
     cells = [split_cells(line, header.delimiter) for line in head.lines[first:first + _LOOKED_AT] if line.strip()]
     rows = [tuple((*row, *[""] * len(names))[:len(names)]) for row in cells]
-    stated = _units_row(head.lines, header, first)
-    units = tuple(_unit_text(name, below) for name, below in zip(names, stated, strict=True))
+    # the row of units below the header, '' in each place without one
+    below = ([*split_cells(line, header.delimiter), *[""] * len(names)][:len(names)]
+             for line in head.lines[header.line:first])
+    stated = next((row for row in below if any(unit_of(quantity, cell) for quantity in QUANTITIES
+                                               for cell in row if cell)), [""] * len(names))
+    units = []
+    for name, unit in zip(names, stated, strict=True):
+        symbols = [one.symbol for quantity in QUANTITIES if (one := unit_in_name(quantity, name)) is not None]
+        units.append(unit if unit and not is_missing(unit) else
+                     split_name(name)[1] or max(symbols, key=len, default=""))      # rad_s also ends like a second
     comma = decimal_sign([cell for cell in row if looks_numeric(cell)] for row in rows) == ","
-    return TraceSurvey(encoding, header.delimiter, header.line, names, units, tuple(rows[:ROWS]), comma,
+    return TraceSurvey(encoding, header.delimiter, header.line, names, tuple(units), tuple(rows[:ROWS]), comma,
                        guess_columns(names, stated, rows, comma=comma))
 
 
@@ -130,23 +138,6 @@ def _is_row(line: str, delimiter: str, width: int) -> bool:
         _is_value(cell) or is_missing(cell) for cell in cells[:1])
 
 
-def _units_row(lines: Sequence[str], header: Header, first: int) -> tuple[str, ...]:
-    """Return the row of units below the header, '' in each place without one."""
-    width = len(header.names)
-    for line in lines[header.line:first]:
-        cells = [*split_cells(line, header.delimiter), *[""] * width][:width]
-        if any(unit_of(quantity, cell) for quantity in QUANTITIES for cell in cells if cell):
-            return tuple(cells)
-    return ("",) * width
-
-
-def _unit_text(name: str, below: str) -> str:
-    if below and not is_missing(below):
-        return below
-    found = [unit.symbol for quantity in QUANTITIES if (unit := unit_in_name(quantity, name)) is not None]
-    return split_name(name)[1] or max(found, key=len, default="")      # rad_s also ends like a second
-
-
 def guess_columns(
     names: Sequence[str], stated: Sequence[str], rows: Sequence[Sequence[str]], *, comma: bool = False
 ) -> tuple[GuessedColumn, ...]:
@@ -154,7 +145,8 @@ def guess_columns(
 
     ``stated``: row of units below the header, '' without one; ``rows``: rows of numbers.
     """
-    unique = [at for at, name in enumerate(names) if name and _once(name, names)]
+    folded = [" ".join(name.casefold().split()) for name in names]       # `find_header` compares names in this way
+    unique = [at for at, name in enumerate(names) if name and folded.count(folded[at]) == 1]
     scored = sorted(
         ((_score(quantity, names[at], stated[at], [row[at] for row in rows if at < len(row)], comma=comma), -at,
           quantity) for at in unique for quantity in QUANTITIES), reverse=True)
@@ -162,20 +154,12 @@ def guess_columns(
     for score, place, quantity in scored:
         if score > 0.0 and quantity not in taken and -place not in taken.values():
             taken[quantity] = -place
-    return tuple(_guessed(quantity, taken.get(quantity), names, stated) for quantity in QUANTITIES)
-
-
-def _once(name: str, names: Sequence[str]) -> bool:
-    """Return whether the name can be chosen: `find_header` compares names in this way."""
-    folded = [" ".join(one.casefold().split()) for one in names]
-    return folded.count(" ".join(name.casefold().split())) == 1
-
-
-def _guessed(quantity: str, at: int | None, names: Sequence[str], stated: Sequence[str]) -> GuessedColumn:
-    if at is None:
-        return GuessedColumn(quantity, "", "")
-    unit = unit_of(quantity, stated[at]) or unit_in_name(quantity, names[at])
-    return GuessedColumn(quantity, names[at], "" if unit is None else unit.symbol)
+    guessed = []
+    for quantity in QUANTITIES:
+        at = taken.get(quantity)
+        unit = None if at is None else unit_of(quantity, stated[at]) or unit_in_name(quantity, names[at])
+        guessed.append(GuessedColumn(quantity, "" if at is None else names[at], "" if unit is None else unit.symbol))
+    return tuple(guessed)
 
 
 def _score(quantity: str, name: str, stated: str, cells: Sequence[str], *, comma: bool) -> float:

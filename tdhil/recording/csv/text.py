@@ -65,12 +65,15 @@ class ClockReader:
             return None
         if found["half"]:
             hours = hours % 12 + (12 if found["half"][0] in "Pp" else 0)
-        base = 3600.0 * hours + 60.0 * minutes - _zone_s(found["zone"])
+        base, zone = 3600.0 * hours + 60.0 * minutes, found["zone"]
+        if zone not in (None, "Z"):
+            offset = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
+            base -= -offset if zone[0] == "-" else offset
         day = self._day(found["date"] or "", base)
         if day is None:
             return None
         self._base_s = base + _DAY_S * day
-        self._prefix = "\0" if found["half"] or found["zone"] else prefix
+        self._prefix = "\0" if found["half"] or zone else prefix
         return self._base_s + second
 
     def _day(self, text: str, of_day_s: float) -> int | None:
@@ -102,13 +105,6 @@ def _ordinal(text: str) -> int | None:
     except ValueError:
         return None
     return None
-
-
-def _zone_s(zone: str | None) -> float:
-    if zone is None or zone == "Z":
-        return 0.0
-    offset = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
-    return -offset if zone[0] == "-" else offset
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -239,7 +235,13 @@ def encoding_of(path: Path) -> str:
     for magic, what in _PACKED.items():
         if head.startswith(magic):
             raise CsvUnusable(f"this is {what} file, no text", where=str(path), next_step="Save the table as CSV")
-    found = next((name for mark, name in _MARKS if head.startswith(mark)), None) or _unmarked(head)
+    found = next((name for mark, name in _MARKS if head.startswith(mark)), None)
+    if found is None:
+        try:
+            codecs.getincrementaldecoder("utf-8")().decode(head)     # incremental: the cut may be inside a character
+            found = "utf-8"
+        except UnicodeDecodeError:
+            found = "cp1252"
     # a logger that lost power leaves NUL characters after its last line
     text = codecs.getincrementaldecoder(found)(errors="replace").decode(head).rstrip("\0")
     odd = sum(sign < " " and sign not in "\t\n\r\f\v" for sign in text)
@@ -249,14 +251,6 @@ def encoding_of(path: Path) -> str:
             next_step="Export the trace as CSV, in UTF-8 (UTF-16 needs its byte order mark)",
         )
     return found
-
-
-def _unmarked(head: bytes) -> str:
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(head)     # incremental: the cut may be inside a character
-    except UnicodeDecodeError:
-        return "cp1252"
-    return "utf-8"
 
 
 def blocks(path: Path, encoding: str) -> Iterator[LineBlock]:
