@@ -57,7 +57,9 @@ def add_trace_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """Read, identify, print."""
+    """Read, identify or evaluate, print."""
+    from tdhil.report import stderr_console
+
     path = _log(namespace)
     settings_in(namespace)
     check_trace(namespace)
@@ -70,7 +72,19 @@ def run(namespace: argparse.Namespace) -> int:
         recorded = replace(recorded, configuration={**recorded.configuration,
                                                     "acceptance": [asdict(one) for one in found.values()]})
     if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
-        return _evaluation(namespace, recorded, report)
+        what = "steps of tdhil tune verify" if is_verification(recorded.configuration) else "a virtual string"
+        for name in settings_in(namespace):
+            raise UsageError(f"is for a run that identifies; this log contains {what}", where=OPTION[name].flag)
+        recorded.require_motion()
+        evaluated = conclude_run(recorded.recording, recorded.configuration, recorded.log, recorded.virtual_string)
+        for problem in recorded.problems:
+            stderr_console().print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
+        try:
+            print_result(evaluated.document, namespace.json)
+        finally:
+            save_report(evaluated.document, recorded.recording, report, recorded.virtual_string)
+        return int(ExitCode.PARTIAL if not recorded.whole and evaluated.exit_code is ExitCode.OK
+                   else evaluated.exit_code)
     return _identify(namespace, recorded, report)
 
 
@@ -88,24 +102,6 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
         given = {option.name: getattr(namespace, option.name) for option in OF_A_TRACE}
         trace = trace_arguments(given, "the command line")
     return read(path, **trace)
-
-
-def _evaluation(namespace: argparse.Namespace, recorded: RunRecord, report: ReportFile | None) -> int:
-    """Evaluate the virtual string or the steps of this log, and print the result."""
-    from tdhil.report import stderr_console
-
-    what = "steps of tdhil tune verify" if is_verification(recorded.configuration) else "a virtual string"
-    for name in settings_in(namespace):
-        raise UsageError(f"is for a run that identifies; this log contains {what}", where=OPTION[name].flag)
-    recorded.require_motion()
-    found = conclude_run(recorded.recording, recorded.configuration, recorded.log, recorded.virtual_string)
-    for problem in recorded.problems:
-        stderr_console().print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
-    try:
-        print_result(found.document, namespace.json)
-    finally:
-        save_report(found.document, recorded.recording, report, recorded.virtual_string)
-    return int(ExitCode.PARTIAL if not recorded.whole and found.exit_code is ExitCode.OK else found.exit_code)
 
 
 def _identify(namespace: argparse.Namespace, recorded: RunRecord, report: ReportFile | None) -> int:

@@ -51,7 +51,7 @@ def _add_output(parser: argparse.ArgumentParser, stated: str) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Read the table, and report changes."""
     from tdhil.fleet import counted, is_archived, read_table, trend_document
-    from tdhil.report import PlainConsole
+    from tdhil.report import Picture, PlainConsole, ReportSection, Text
 
     report = ReportFile.of_files(namespace, namespace.table)
     rows = read_table(namespace.table)
@@ -76,13 +76,20 @@ def run(namespace: argparse.Namespace) -> int:
         for note in document["notes"]:
             console.print(f"note: {note}", soft_wrap=True)
     if report is not None:
-        report.write(_trend_report(document), ())
+        caption = "Each result with its 95 % coverage interval; a vertical line marks a change."
+        if document["rehearsed_faults"]:
+            caption += " Hollow: a rehearsal of faults on the simulated drive."
+        lines = (*(_followed_text(one) for one in document["quantities"]), *document["notes"])
+        picture = Picture("trend", partial(_draw_trend, document=document), 7.5, caption)
+        report.write(_report(f"{document['rig']} over time", document, (
+            ReportSection("Changes", tuple(map(Text, lines))), ReportSection("Over time", (picture,)))), ())
     return 0
 
 
 def run_compare(namespace: argparse.Namespace) -> int:
     """Identify each log, and compare it with the first."""
     from tdhil.fleet import FleetSettings, compare_document, identified, is_archived
+    from tdhil.report import Column, Picture, ReportSection, Table, Text
 
     if len(namespace.logs) < 2:
         raise UsageError(f"{len(namespace.logs)} log is named, and compare needs two or more",
@@ -109,7 +116,16 @@ def run_compare(namespace: argparse.Namespace) -> int:
     else:
         _print_compared(document)
     if report is not None:
-        report.write(_compare_report(document), [run.document for run in runs])
+        headings = _headings(document["logs"])
+        table = Table(
+            (Column("", 0.04), Column("setting", 0.26), *(Column(one, 0.7 / len(headings)) for one in headings)), tuple(
+                ("≠" if one["differs"] else "", one["name"], *map(str, one["values"])) for one in document["settings"]))
+        picture = Picture(
+            "compare", partial(_draw_curves, document=document), 3.4, "Apparent inertia at the excited frequencies.")
+        report.write(_report("Runs compared", document, (
+            ReportSection("Differences", tuple(Text(f"{one['to']}: {one['text']}") for one in document["differences"])),
+            ReportSection("Apparent inertia", (picture,)), ReportSection("Settings", (table,)),
+        )), [run.document for run in runs])
     return 0
 
 
@@ -184,32 +200,6 @@ def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Output as a report, with a figure
-
-
-def _trend_report(document: Mapping[str, Any]) -> Report:
-    from tdhil.report import Picture, ReportSection, Text
-
-    caption = "Each result with its 95 % coverage interval; a vertical line marks a change."
-    if document["rehearsed_faults"]:
-        caption += " Hollow: a rehearsal of faults on the simulated drive."
-    lines = (*(_followed_text(one) for one in document["quantities"]), *document["notes"])
-    picture = Picture("trend", partial(_draw_trend, document=document), 7.5, caption)
-    return _report(f"{document['rig']} over time", document, (
-        ReportSection("Changes", tuple(map(Text, lines))), ReportSection("Over time", (picture,))))
-
-
-def _compare_report(document: Mapping[str, Any]) -> Report:
-    from tdhil.report import Column, Picture, ReportSection, Table, Text
-
-    headings = _headings(document["logs"])
-    settings = Table(
-        (Column("", 0.04), Column("setting", 0.26), *(Column(one, 0.7 / len(headings)) for one in headings)),
-        tuple(("≠" if one["differs"] else "", one["name"], *map(str, one["values"])) for one in document["settings"]))
-    picture = Picture(
-        "compare", partial(_draw_curves, document=document), 3.4, "Apparent inertia at the excited frequencies.")
-    return _report("Runs compared", document, (
-        ReportSection("Differences", tuple(Text(f"{one['to']}: {one['text']}") for one in document["differences"])),
-        ReportSection("Apparent inertia", (picture,)), ReportSection("Settings", (settings,))))
 
 
 def _report(title: str, document: Mapping[str, Any], sections: tuple[ReportSection, ...]) -> Report:
