@@ -15,7 +15,7 @@ from weakref import WeakSet
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
 from tdhil.config import ASKED_AGAIN, OPTIONS, Option, Topic
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import MessageCode, UsageError, existing_file
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as typed on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
@@ -111,6 +111,29 @@ def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
             raise UsageError(f"{value:g}: must be {wanted}", where=one.flag, entry=MessageCode.VALUE_NOT_ALLOWED)
         given[one.name] = value
     return given
+
+
+def require_log(path: Path) -> None:
+    """Raise UsageError if there is no such log."""
+    if not path.is_file():
+        raise UsageError("this log does not exist", where=str(path), next_step="Name a run.mcap of tdhil",
+                         entry=MessageCode.FILE_NOT_FOUND)
+
+
+def require_target(flag: str, path: Path, sources: Iterable[Path], source: str) -> None:
+    """Check, before the computation, that a new file can be written to ``path``. Raises UsageError.
+
+    ``sources``: the files that are read; ``source``: what they are, such as ``the log``.
+    """
+    where = f"{flag} {path}"
+    if path.resolve() in [one.resolve() for one in sources]:
+        raise UsageError(f"is {source} itself", where=where, next_step="Name another file",
+                         entry=MessageCode.SAME_FILE_TWICE)
+    if path.exists():
+        raise existing_file(where)
+    if not path.parent.is_dir():
+        raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
+                         entry=MessageCode.FILE_NOT_WRITABLE)
 
 
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:

@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
+from tdhil.cli.arguments import require_log
 from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, UsageError, existing_file
 
 if TYPE_CHECKING:
@@ -46,9 +47,7 @@ def run(namespace: argparse.Namespace) -> int:
 
     path: Path = namespace.log
     target: Path = namespace.output or path.with_suffix(SUFFIXES[namespace.to])
-    if not path.is_file():
-        raise UsageError("this log does not exist", where=str(path), next_step="Name a run.mcap of tdhil",
-                         entry=MessageCode.FILE_NOT_FOUND)
+    require_log(path)
     if target.exists():
         raise existing_file(target)
     if namespace.to == "parquet":

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from profiles import with_code
-from tdhil.cli.arguments import add_option, add_settings, settings_in
+from tdhil.cli.arguments import add_option, add_settings, require_target, settings_in
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.csv_text import cell_of
-from tdhil.errors import ExitCode, MessageCode, UsageError, existing_file
+from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.session import is_evaluation, is_verification, require_file
 
 if TYPE_CHECKING:
@@ -90,18 +90,10 @@ def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
     for flag, path, endings in (("--out", namespace.out, _TABLES), ("--plot", namespace.plot, _PICTURES)):
         if path is None:
             continue
-        where = f"{flag} {path}"
         if path.suffix.lower() not in endings:
-            raise UsageError(f"ends in none of {', '.join(endings)}", where=where,
+            raise UsageError(f"ends in none of {', '.join(endings)}", where=f"{flag} {path}",
                              next_step=f"Such as {flag} frf{endings[0]}", entry=MessageCode.VALUE_NOT_ALLOWED)
-        if path.resolve() in [log.resolve() for log in logs]:
-            raise UsageError("is the log itself", where=where, next_step="Name another file",
-                             entry=MessageCode.SAME_FILE_TWICE)
-        if path.exists():
-            raise existing_file(where)
-        if not path.parent.is_dir():
-            raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
-                             entry=MessageCode.FILE_NOT_WRITABLE)
+        require_target(flag, path, logs, "the log")
     if namespace.out is not None and namespace.out.suffix.lower() == ".parquet":
         _duckdb()
     if namespace.plot is not None:

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.arguments import add_option
+from tdhil.cli.arguments import add_option, require_log
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import ExitCode, MessageCode, UsageError
@@ -32,9 +32,7 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.session import check_log_path, make_room
 
     path, target = namespace.log, namespace.output
-    if not path.is_file():
-        raise UsageError("this log does not exist", where=str(path), next_step="Name a run.mcap of tdhil",
-                         entry=MessageCode.FILE_NOT_FOUND)
+    require_log(path)
     if target is not None and target.exists() and target.samefile(path):
         raise UsageError("would be written over the log itself", where=f"-o {target}", next_step="Name another file",
                          entry=MessageCode.SAME_FILE_TWICE)

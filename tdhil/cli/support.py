@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.buses import all_buses
+from tdhil.cli.arguments import require_log
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError, existing_file
 from tdhil.evidence import Scrub
 from tdhil.version import __version__
@@ -44,9 +45,7 @@ def run(namespace: argparse.Namespace) -> int:
     """Write the archive. Exit 0: complete; 3: the log is partly or not readable. Raises UsageError."""
     log: Path = namespace.log
     target: Path = namespace.output or log.with_name(f"{log.stem}.support.zip")
-    if not log.is_file():
-        raise UsageError("this log does not exist", where=str(log), next_step="Name a run.mcap of tdhil",
-                         entry=MessageCode.FILE_NOT_FOUND)
+    require_log(log)
     if namespace.rig is not None and not namespace.rig.is_file():
         raise UsageError("this file does not exist", where=f"--rig {namespace.rig}", entry=MessageCode.FILE_NOT_FOUND)
     scrub = Scrub.of_this_computer()

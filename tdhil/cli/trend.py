@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.arguments import add_left_out, add_option, add_settings, settings_in
+from tdhil.cli.arguments import add_left_out, add_option, add_settings, require_log, settings_in
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
@@ -96,9 +96,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
                          next_step="Name another log: tdhil compare before.mcap after.mcap",
                          entry=MessageCode.LOG_NEEDED)
     for log in namespace.logs:
-        if not log.is_file():
-            raise UsageError("this log does not exist", where=str(log), next_step="Name a run.mcap of tdhil",
-                             entry=MessageCode.FILE_NOT_FOUND)
+        require_log(log)
         if not namespace.archived and is_archived(log):
             raise UsageError("tdhil serve has archived this run", where=str(log),
                              next_step="Add --archived, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)

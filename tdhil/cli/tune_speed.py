@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
-from tdhil.cli.arguments import add_option, amount
+from tdhil.cli.arguments import add_option, amount, require_target
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
@@ -88,10 +88,10 @@ def run(namespace: argparse.Namespace) -> int:
     """Read, tune, print."""
     from tdhil.report import (
         PlainConsole,
-        check_picture_path,
         loop_document,
         loop_report,
         print_loop_tuning,
+        require_extra,
         save_loop_picture,
         stderr_console,
     )
@@ -100,7 +100,8 @@ def run(namespace: argparse.Namespace) -> int:
     _check(namespace)
     report = ReportFile.of_files(namespace, namespace.result)
     if namespace.plot is not None:
-        check_picture_path(namespace.plot, namespace.result)
+        require_extra("--plot")
+        require_target("--plot", namespace.plot, [namespace.result], "the result")
     result = read_result(namespace.result)       # a log is identified again, which takes seconds
     measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
     lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)

@@ -158,7 +158,15 @@ def history(results: Sequence[Measured], confidence: float = 0.95) -> History:
     x, sd = (np.array(column) for column in zip(*(_on_scale(one, relative) for one in results), strict=True))
     if not np.all(sd > 0.0):
         raise ValueError("an interval of no width")
-    known = _Series(x, sd, *_scales(results, relative), time)
+    drives = list(dict.fromkeys(one.drive for one in results if one.drive is not None))
+    shared, own = np.zeros((len(results), len(drives))), np.zeros(len(results))
+    for row, one in enumerate(results):
+        size = one.scale_rel_sd * (1.0 if relative else one.value)
+        if one.drive is None:
+            own[row] = size
+        else:
+            shared[row, drives.index(one.drive)] = size
+    known = _Series(x, sd, shared, own, time)
     whole = _evidence(known)
     drifts = whole.none < ALARM and whole.drift > whole.step
     found = [] if drifts or whole.none >= ALARM else _placed(known, _steps(known, 0))
@@ -181,24 +189,13 @@ def _on_scale(one: Measured, relative: bool) -> tuple[float, float]:
     return one.value, (one.high - one.low) / (2.0 * quantile)
 
 
-def _scales(results: Sequence[Measured], relative: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviations that the torque scales cause: U with a column for each drive, and those of results
-    of an unknown drive, which share their scale with no other.
-    """
-    drives = list(dict.fromkeys(one.drive for one in results if one.drive is not None))
-    shared, own = np.zeros((len(results), len(drives))), np.zeros(len(results))
-    for row, one in enumerate(results):
-        size = one.scale_rel_sd * (1.0 if relative else one.value)
-        if one.drive is None:
-            own[row] = size
-        else:
-            shared[row, drives.index(one.drive)] = size
-    return shared, own
-
-
 @dataclass(frozen=True)
 class _Series:
-    """Results of a history. ``x``, ``sd``, ``own``, ``time``: (n,), ``shared``: (n, drives), see `_scales`."""
+    """Results of a history. ``x``, ``sd``, ``own``, ``time``: (n,), ``shared``: (n, drives).
+
+    Standard deviations that the torque scales cause: ``shared`` is U with a column for each drive; ``own`` is that of
+    results of an unknown drive, which share their scale with no other.
+    """
 
     x: FloatArray
     sd: FloatArray

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from profiles.quantities import printed_ends, printed_interval
 from tdhil.errors import UsageError
-from tdhil.fleet.change_detection import LEAST, Difference, History, Measured, difference, history
+from tdhil.fleet.change_detection import LEAST, Difference, Measured, difference, history
 from tdhil.fleet.rows import FleetRow, FleetSettings, counted, row_of
 
 _GOOD: Final = ("valid", "valid_wide")
@@ -187,21 +187,18 @@ def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dic
         for change in found.changes
     ]
     document["drift"] = None if found.drift_change is None else asdict(found.drift_change)
-    return document | {"text": _trend_text(found, document, quantity.unit)}
-
-
-def _trend_text(found: History, document: Mapping[str, Any], unit: str) -> str:
     if not found.changed:
-        return f"no change is named: that there was none is {_probable(found.none)}"
-    if found.drift_change is not None:
-        return (f"drifts by {_change_text(found.drift_change, unit)} from first to last "
+        text = f"no change is named: that there was none is {_probable(found.none)}"
+    elif found.drift_change is not None:
+        text = (f"drifts by {_change_text(found.drift_change, quantity.unit)} from first to last "
                 f"(that there was a change is {_probable(1 - found.none)}, an even drift {_probable(found.drift)})")
-    steps = [
-        f"changed by {_change_text(point.change, unit)} {_between(one)} "
-        f"(that there was a step is {_probable(point.probability)}, at just this place {_probable(point.here)})"
-        for point, one in zip(found.changes, document["changes"], strict=True)
-    ]
-    return "; ".join(steps) or f"changed ({_probable(1 - found.none)}), but where isn't clear"
+    else:
+        text = "; ".join(
+            f"changed by {_change_text(point.change, quantity.unit)} {_between(one)} "
+            f"(that there was a step is {_probable(point.probability)}, at just this place {_probable(point.here)})"
+            for point, one in zip(found.changes, document["changes"], strict=True)
+        ) or f"changed ({_probable(1 - found.none)}), but where isn't clear"
+    return document | {"text": text}
 
 
 def _probable(share: float) -> str:
@@ -345,23 +342,22 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
             "name": quantity.name, "column": quantity.column, "unit": quantity.unit, **asdict(change),
             "differs": change.differs,
         })
-    return found | {"text": _compare_text(first, other, found["quantities"])}
-
-
-def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping[str, Any]]) -> str:
-    inertia = next((one for one in quantities if one["column"] == INERTIA_COLUMN), None)
+    inertia = next((one for one in found["quantities"] if one["column"] == INERTIA_COLUMN), None)
     if None not in (first.inertia_kg_m2, other.inertia_kg_m2) and first.inertia_scope != other.inertia_scope:
-        return (f"the inertias can't be compared: {first.log} has {_scope_text(first.inertia_scope)}, and {other.log}"
+        text = (f"the inertias can't be compared: {first.log} has {_scope_text(first.inertia_scope)}, and {other.log}"
                 f" has {_scope_text(other.inertia_scope)}. Compare them with the same --model")
-    if inertia is None:
+    elif inertia is None:
         without = first if first.inertia_kg_m2 is None else other
-        return f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"
-    change = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
-    scale = "the torque scale is one drive's and cancels" if change.shared_scale else (
-        "two torque calibrations: the scale of each is in it" if first.torque_calibration != other.torque_calibration
-        else "two drives: the torque scale of each is in it")
-    if change.shared_scale and not (first.drive_serial and other.drive_serial):
-        scale = "no serial numbers: taken for one drive, whose torque scale cancels"
-    says = "differ" if change.differs else "do not differ significantly"
-    parts = "".join(f"; {row.log}: {row.part_text}" for row in (first, other) if row.part_text is not None)
-    return f"the inertias {says}: {_change_text(change, 'kg·m²')} at {change.confidence:.0%}; {scale}{parts}"
+        text = f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"
+    else:
+        change = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
+        scale = "the torque scale is one drive's and cancels" if change.shared_scale else (
+            "two torque calibrations: the scale of each is in it"
+            if first.torque_calibration != other.torque_calibration
+            else "two drives: the torque scale of each is in it")
+        if change.shared_scale and not (first.drive_serial and other.drive_serial):
+            scale = "no serial numbers: taken for one drive, whose torque scale cancels"
+        says = "differ" if change.differs else "do not differ significantly"
+        parts = "".join(f"; {row.log}: {row.part_text}" for row in (first, other) if row.part_text is not None)
+        text = f"the inertias {says}: {_change_text(change, 'kg·m²')} at {change.confidence:.0%}; {scale}{parts}"
+    return found | {"text": text}

@@ -68,7 +68,11 @@ class Container:
         self._offset = 0
         self._tail = b""                                # last bytes written
         self._seam: tuple[int, bytes] = (0, b"")        # their position, and the bytes before them
-        self._watched = _is_named(file)
+        try:        # pipes, devices and some file systems have no count of names
+            found = os.fstat(file.fileno())
+            self._watched = stat.S_ISREG(found.st_mode) and found.st_nlink > 0
+        except (OSError, ValueError):
+            self._watched = False
         self._compress = zstandard.ZstdCompressor(level=level).compress
         self._parts: list[bytes] = []
         self._size = 0
@@ -193,15 +197,6 @@ class Container:
                 f"the file was cut to less than {start + len(before)} of {self._offset} bytes"
                 " while it was being written",
             )
-
-
-def _is_named(file: RawFile) -> bool:
-    """Return whether this is a regular file with a count of names. Pipes, devices and some file systems have none."""
-    try:
-        found = os.fstat(file.fileno())
-    except (OSError, ValueError):
-        return False
-    return stat.S_ISREG(found.st_mode) and found.st_nlink > 0
 
 
 def _declarations() -> tuple[list[bytes], list[bytes]]:

@@ -67,8 +67,8 @@ if TYPE_CHECKING:
     )
     from tdhil.report.operator_map import map_document as map_document
     from tdhil.report.speed_loop import (
-        LoopTunedFor as LoopTunedFor, check_picture_path as check_picture_path, loop_document as loop_document,
-        loop_report as loop_report, print_loop_tuning as print_loop_tuning, save_loop_picture as save_loop_picture,
+        LoopTunedFor as LoopTunedFor, loop_document as loop_document, loop_report as loop_report,
+        print_loop_tuning as print_loop_tuning, save_loop_picture as save_loop_picture,
     )
     from tdhil.report.schedule import schedule_document as schedule_document
     from tdhil.report.tuning import (
@@ -97,8 +97,7 @@ else:
         "operator_map": "map_document",
         "severity": "print_severity severity_document severity_report",
         "schedule": "schedule_document",
-        "speed_loop": "LoopTunedFor check_picture_path loop_document loop_report print_loop_tuning "
-                      "save_loop_picture",
+        "speed_loop": "LoopTunedFor loop_document loop_report print_loop_tuning save_loop_picture",
         "tuning": "TunedFor print_tuning showcase_of tuning_document tuning_report",
         "factor_calibration": "factor_report known_pipe_document pairs_document print_factor reference_document",
     })

@@ -100,7 +100,15 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
         inside, apart = least <= low and high <= most, high < least or most < low
         verdict = AcceptanceVerdict.PASS if inside else (
             AcceptanceVerdict.FAIL if apart else AcceptanceVerdict.CANNOT_TELL)
-        other = _other_scope(expected.name, document)
+        other, scope = "", document.get("inertia_scope")          # none: a refusal
+        if expected.name in _INERTIAS and scope is not None:
+            # With a string the expected J is that of the motor's side, as for ``motor-inertia``. Else it is that of
+            # all that turns.
+            has_string = (document.get("rig") or {}).get("load") == "string"
+            own = InertiaScope.MOTOR_SIDE if has_string or expected.name != "inertia" else InertiaScope.MOTOR_AND_LOAD
+            if scope != own:
+                advice = "; expect motor-inertia instead" if scope == InertiaScope.MOTOR_SIDE else ""
+                other = f", which is {scope_text(scope)}, not {scope_text(own)}{advice}"
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
         span = "" if low == high else f" ({printed_interval(low, high, 5)})"     # a setting of the run has none
         seen = f"identified {value:.5g}{span}{other}"
@@ -129,23 +137,6 @@ def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | N
     if value is None or low is None or high is None:
         return value, low, high
     return scale * value, scale * low, scale * high
-
-
-def _other_scope(name: str, document: Part) -> str:
-    """Return which J the result has instead of the expected one, in words; '' if it is the expected one.
-
-    With a string the expected J is that of the motor's side, as for ``motor-inertia``. Else it is that of all that
-    turns.
-    """
-    scope = document.get("inertia_scope")          # none: a refusal
-    if name not in _INERTIAS or scope is None:
-        return ""
-    has_string = (document.get("rig") or {}).get("load") == "string"
-    wanted = InertiaScope.MOTOR_SIDE if has_string or name != "inertia" else InertiaScope.MOTOR_AND_LOAD
-    if scope == wanted:
-        return ""
-    advice = "; expect motor-inertia instead" if scope == InertiaScope.MOTOR_SIDE else ""
-    return f", which is {scope_text(scope)}, not {scope_text(wanted)}{advice}"
 
 
 def _causes(rows: Sequence[Accepted]) -> Iterable[str]:

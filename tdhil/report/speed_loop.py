@@ -16,13 +16,13 @@ from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from profiles import CodedText, MessageCode, entry_of, with_code
-from tdhil.errors import UsageError, existing_file
+from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, only_finite
 from tdhil.report.graphs import GRAPHS
-from tdhil.report.page import repeatable_figures, require_extra
+from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import plain_ticks
 from tdhil.report.schedule import gain_words
 from tdhil.soft_torque import DriveSetting
@@ -355,20 +355,6 @@ def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Figures and the page
-
-
-def check_picture_path(path: Path, source: Path) -> None:
-    """Check, before the computation, that a figure can be written to this path. Raises UsageError."""
-    require_extra("--plot")
-    where = f"--plot {path}"
-    if path.resolve() == source.resolve():
-        raise UsageError("is the result itself", where=where, next_step="Name another file",
-                         entry=MessageCode.SAME_FILE_TWICE)
-    if path.exists():
-        raise existing_file(where)
-    if not path.parent.is_dir():
-        raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
-                         entry=MessageCode.FILE_NOT_WRITABLE)
 
 
 def save_loop_picture(document: Part, path: Path) -> None:

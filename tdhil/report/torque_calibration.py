@@ -150,7 +150,19 @@ def _sections(document: Part) -> Iterator[ReportSection]:
             "The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"
             f" probability of {100 * factor['confidence']:g} %. Of a calibrated torque, the share that comes from the"
             " unit of speed is part of κ: κ is right for inertia and for torque over acceleration.")))
-        yield ReportSection("Uncertainty budget", (_factor_budget(document), Text(_BUDGET_NOTE)))
+        rows = []
+        for line in document["budget"]:
+            dof, sd = line["degrees_of_freedom"], line["standard_uncertainty_kg_m2"]
+            shares = [cell for key in ("of_factor", "of_inertia") for cell in (
+                f"{100 * line[key] / sd:.3g}" if sd > 0.0 else "", f"{100 * line[key]:.3f}")]
+            rows.append((line["source"], f"{sd:.3g}", line["distribution"], shown_degrees(dof), *shares))
+        total = ["combined", "", "", ""]
+        for key in ("calibration_factor", "inertia_kg_m2"):
+            total += ["", f"{100 * document[key]['standard_uncertainty'] / document[key]['value']:.3f}"]
+        columns = (Column("input quantity X", 0.26), Column("u, kg·m²", 0.12, True), Column("distribution", 0.14),
+                   Column("ν", 0.08, True), Column("c of κ", 0.1, True), Column("c·u of κ, %", 0.1, True),
+                   Column("c of J", 0.1, True), Column("c·u of J, %", 0.1, True))
+        yield ReportSection("Uncertainty budget", (Table(columns, (*rows, tuple(total))), Text(_BUDGET_NOTE)))
     if document["line"] is not None:
         yield ReportSection("Identified over known inertia", (_picture(document), _data(document)))
     yield recordings(document)
@@ -174,22 +186,6 @@ _BUDGET_NOTE = (
 def _results(document: Part) -> Table:
     return result_rows((("calibration factor κ", document["calibration_factor"], "1"),
                         ("moment of inertia J", document["inertia_kg_m2"], "kg·m²")))
-
-
-def _factor_budget(document: Part) -> Table:
-    rows = []
-    for line in document["budget"]:
-        dof, sd = line["degrees_of_freedom"], line["standard_uncertainty_kg_m2"]
-        shares = [cell for key in ("of_factor", "of_inertia") for cell in (
-            f"{100 * line[key] / sd:.3g}" if sd > 0.0 else "", f"{100 * line[key]:.3f}")]
-        rows.append((line["source"], f"{sd:.3g}", line["distribution"], shown_degrees(dof), *shares))
-    total = ["combined", "", "", ""]
-    for key in ("calibration_factor", "inertia_kg_m2"):
-        total += ["", f"{100 * document[key]['standard_uncertainty'] / document[key]['value']:.3f}"]
-    columns = (Column("input quantity X", 0.26), Column("u, kg·m²", 0.12, True), Column("distribution", 0.14),
-               Column("ν", 0.08, True), Column("c of κ", 0.1, True), Column("c·u of κ, %", 0.1, True),
-               Column("c of J", 0.1, True), Column("c·u of J, %", 0.1, True))
-    return Table(columns, (*rows, tuple(total)))
 
 
 def _data(document: Part) -> Table:

@@ -168,26 +168,23 @@ def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, 
                              entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         if quantity in found:
             raise UsageError(f"{quantity} is named twice", where=flag, entry=MessageCode.CSV_COLUMNS_UNCLEAR)
-        found[quantity] = _choice(quantity, name.strip(), flag)
+        column, colon, spelt = name.strip().rpartition(":")
+        unit = unit_of(quantity, spelt)
+        if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a complete name
+            found[quantity] = ColumnChoice(quantity, name.strip())
+        elif column and unit is not None:
+            found[quantity] = ColumnChoice(quantity, column.strip(), unit)
+        else:
+            raise UsageError(
+                f"{shown(spelt)!r} is not a unit of {quantity}; use {', '.join(known_units(quantity))}",
+                where=flag, next_step="If the colon belongs to the column's name, write the unit behind another colon",
+                entry=MessageCode.CSV_COLUMNS_UNCLEAR,
+            )
     names = [choice.name.casefold() for choice in found.values()]
     if len(set(names)) < len(names):
         raise UsageError("one column can't hold two quantities", where=flag, next_step=such_as,
                          entry=MessageCode.CSV_COLUMNS_UNCLEAR)
     return tuple(found.get(quantity, ColumnChoice(quantity)) for quantity in quantities)
-
-
-def _choice(quantity: str, text: str, flag: str) -> ColumnChoice:
-    name, colon, spelt = text.rpartition(":")
-    if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a complete name
-        return ColumnChoice(quantity, text)
-    unit = unit_of(quantity, spelt)
-    if unit is None or not name:
-        raise UsageError(
-            f"{shown(spelt)!r} is not a unit of {quantity}; use {', '.join(known_units(quantity))}",
-            where=flag, next_step="If the colon belongs to the column's name, write the unit behind another colon",
-            entry=MessageCode.CSV_COLUMNS_UNCLEAR,
-        )
-    return ColumnChoice(quantity, name.strip(), unit)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

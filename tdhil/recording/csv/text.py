@@ -77,7 +77,7 @@ class ClockReader:
         return self._base_s + second
 
     def _day(self, text: str, of_day_s: float) -> int | None:
-        """Return the days since the first cell's day; None for an invalid date."""
+        """Return the days since the first cell's day; None for an invalid date, or one with ambiguous day and month."""
         if not text:
             if self._last_s >= _DAY_S - 3600.0 and of_day_s < 3600.0:
                 self._night += 1
@@ -86,25 +86,19 @@ class ClockReader:
         if text not in self._days:
             if len(self._days) > 366:
                 return None
-            ordinal = _ordinal(text)
-            if ordinal is None:
+            try:
+                if found := _YEAR_FIRST.fullmatch(text):
+                    ordinal = date(int(found[1]), int(found[2]), int(found[3])).toordinal()
+                elif found := _YEAR_LAST.fullmatch(text):
+                    ordinal = date(int(found[3]), int(found[2]), int(found[1])).toordinal()
+                else:
+                    return None
+            except ValueError:
                 return None
             if self._first is None:
                 self._first = ordinal
             self._days[text] = ordinal - self._first
         return self._days[text]
-
-
-def _ordinal(text: str) -> int | None:
-    """Return the day's number; None for an invalid date, or one with ambiguous day and month."""
-    try:
-        if found := _YEAR_FIRST.fullmatch(text):
-            return date(int(found[1]), int(found[2]), int(found[3])).toordinal()
-        if found := _YEAR_LAST.fullmatch(text):
-            return date(int(found[3]), int(found[2]), int(found[1])).toordinal()
-    except ValueError:
-        return None
-    return None
 
 
 # ---------------------------------------------------------------------------------------------------------------------
