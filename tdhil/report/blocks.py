@@ -7,7 +7,7 @@ wide.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -155,9 +155,30 @@ def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
         answer=_answer(document),
         warnings=coded_warnings(document),
         sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),
-        footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+        footer=_footer(document, sha256),
         reference=reference_of(document),
     )
+
+
+def report_of_run(
+    document: Part, title: str, facts: Iterable[str | None], answer: AnswerBox, sections: Iterable[ReportSection],
+    sha256: str,
+) -> Report:
+    """Return the report of a run that does not identify; ``facts``: of the subtitle, ``sha256``: of its log."""
+    return Report(
+        title=title,
+        subtitle=" · ".join(fact for fact in facts if fact),
+        simulated=banner(document),
+        answer=answer,
+        warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
+        sections=tuple(sections),
+        footer=_footer(document, sha256),
+        reference=reference_of(document),
+    )
+
+
+def _footer(document: Part, sha256: str) -> str:
+    return f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else "")
 
 
 def reference_of(document: Part) -> tuple[tuple[str, str], ...]:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.table import Table as Grid
+from rich.text import Text as Words
+
 from tdhil.report.acceptance import SIGNATURE_LINE
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection, Table, shown_date
 from tdhil.report.card import interval_and_share, sentence
-from tdhil.report.document import SIMULATED
+from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.document import NO_REAL_SHAFT, SIMULATED
 
 if TYPE_CHECKING:
     from tdhil.calibration import MeasuredValue
@@ -42,6 +48,42 @@ def scale_error(factor: Part, quantity: str = "torque") -> str:
     """Return the error of the drive's own quantity: ``4.8 % too much torque``."""
     error = 100.0 * (1.0 / factor["value"] - 1.0)
     return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} {quantity}"
+
+
+def print_calibration_card(
+    document: Part, title: str, rows: Iterable[tuple[str, str | Words]], headings: Collection[str],
+    budget: Sequence[tuple[str, ...]], console: PlainConsole, *, quantity: str = "torque", remark: str = "",
+) -> None:
+    """Print the card of a calibration: verdict, κ, ``rows``, budget, reason, advice, ``remark`` and warnings.
+
+    ``budget``: the sources with their figures under ``headings``; empty without one.
+    """
+    verdict, factor = document["verdict"], document["calibration_factor"]
+    shown = names_and_texts([("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))])
+    if factor is not None:
+        shown.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
+        shown.add_row(
+            "", f"true {quantity} = κ · reported {quantity}: the drive reports {scale_error(factor, quantity)}")
+    for row in rows:
+        shown.add_row(*row)
+    body: list[RenderableType] = [shown]
+    if budget:
+        table = Grid.grid(padding=(0, 2))
+        table.add_column(style="dim")
+        for _ in headings:
+            table.add_column(justify="right", no_wrap=True)
+        table.add_row(Words("uncertainty budget", style="italic"), *(Words(one, style="dim") for one in headings))
+        for line in budget:
+            table.add_row(*line)
+        body.append(table)
+    body.append(Words(sentence(document["reason"])))
+    if document["advice"]:
+        body.append(Words(sentence(document["advice"]), style="italic"))
+    if remark:
+        body.append(Words(sentence(remark), style="dim"))
+    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
+    title += f" · {SIMULATED}" if document["simulated"] else ""
+    console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
 
 
 def shown_degrees(dof: float) -> str:
@@ -98,7 +140,7 @@ def laboratory_page(
     return Report(
         title=f"Calibration of a drive's {quantity}",
         subtitle=shown_date(document["date"]),
-        simulated=f"{SIMULATED}: drive and rig are simulated, no real shaft turned" if document["simulated"] else "",
+        simulated=f"{SIMULATED}: {NO_REAL_SHAFT}" if document["simulated"] else "",
         answer=AnswerBox(
             VERDICT_COLOUR.get(document["verdict"], "yellow"),
             "No number" if factor is None else f"κ = {with_share(factor, '')}", tuple(lines), document["verdict"],

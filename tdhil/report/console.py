@@ -6,9 +6,11 @@ import sys
 from collections.abc import Iterable
 from typing import TextIO
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
 from profiles import visible
 
@@ -44,3 +46,26 @@ def names_and_texts(rows: Iterable[tuple[str, RenderableType]], *, quiet: bool =
     for row in rows:
         grid.add_row(*row)
     return grid
+
+
+def figures_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: int = 1) -> Table:
+    """Return a table of figures. The first ``left`` columns are aligned on the left. A cell that begins with "!"
+    exceeds a limit and is red.
+    """
+    grid = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for at, name in enumerate(headings):
+        grid.add_column(name, justify="left" if at < left else "right")
+    for cells in rows:
+        grid.add_row(*(Text(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
+    return grid
+
+
+def print_settings(settings: Iterable[tuple[str, str, str]], console: Console) -> None:
+    """Print parameters of the drive with the value to enter and its confidence."""
+    console.print(Text("to be typed into the drive, by hand", style="bold"))
+    grid = Table.grid(padding=(0, 2))
+    for _ in range(2):
+        grid.add_column(overflow="fold")
+    for title, value, sure in settings:
+        grid.add_row(title, f"{value} ({sure})")
+    console.print(grid)

@@ -17,6 +17,8 @@ from tdhil.report.inertia_scope import scope_of
 from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
+NO_REAL_SHAFT = "drive and rig are simulated, no real shaft turned"
+"""Explanation of `SIMULATED` on a page."""
 UPLOADED = "UPLOADED"
 """Mark of a recording that was uploaded to the service, which did not make the run itself."""
 
@@ -85,7 +87,7 @@ def banner(document: Mapping[str, Any]) -> str:
     """Return the marks of a report with their meaning, '' without a mark."""
     if not (found := marks(document)):
         return ""
-    said = ["drive and rig are simulated, no real shaft turned"] if document["simulated"] else []
+    said = [NO_REAL_SHAFT] if document["simulated"] else []
     if faults := ", ".join(document.get("rehearsed_faults") or ()):
         said.append(f"rehearsed: {faults}. The history of the rig does not include this result")
     if document.get("uploaded"):

@@ -20,11 +20,11 @@ from tdhil.report.blocks import (
     Report,
     ReportSection,
     Table,
-    reference_of,
+    report_of_run,
     shown_date,
 )
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import banner, marks, rehearsal_rows, run_facts
+from tdhil.report.document import marks, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
@@ -177,16 +177,8 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
         ReportSection("Basis of the result", (Pairs(tuple(_rests_on(document))),)),
         ReportSection("Run", (Pairs(tuple(_run(document, sha256))),)),
     ]
-    return Report(
-        title="Speed controller on a virtual drill string",
-        subtitle=" · ".join(fact for fact in facts if fact),
-        simulated=banner(document),
-        answer=_answer(document),
-        warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
-        sections=tuple(sections),
-        footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
-        reference=reference_of(document),
-    )
+    return report_of_run(
+        document, "Speed controller on a virtual drill string", facts, _answer(document), sections, sha256)
 
 
 def _answer(document: Part) -> AnswerBox:

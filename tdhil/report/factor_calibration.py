@@ -12,27 +12,21 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Group
-from rich.panel import Panel
-from rich.table import Table as Grid
-from rich.text import Text as Words
 
 from tdhil.report.blocks import Block, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
-    VERDICT_STYLE,
     calibrated_item,
     date_and_signature,
     laboratory_page,
+    print_calibration_card,
     quantity,
     recordings,
     result_rows,
     scale_error,
     shown_degrees,
-    with_share,
 )
-from tdhil.report.card import sentence, with_interval
-from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED
+from tdhil.report.card import with_interval
+from tdhil.report.console import PlainConsole
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
 
@@ -160,30 +154,11 @@ def _number(value: float) -> float | None:
 
 def print_factor(document: Part, console: PlainConsole) -> None:
     """Print the card of a calibration without a body on a console."""
-    rows = names_and_texts(())
-    verdict, factor = document["verdict"], document["calibration_factor"]
-    rows.add_row("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))
-    if factor is not None:
-        rows.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
-        rows.add_row("", f"true torque = κ · reported torque: the drive reports {scale_error(factor)}")
-    for name, text in _CARD_ROWS[document["method"]](document):
-        rows.add_row(name, text)
-    body: list[Any] = [rows]
-    shown = factor or document.get("measured_factor")
-    if shown and document["budget"]:
-        table = Grid.grid(padding=(0, 2))
-        table.add_column(style="dim")
-        table.add_column(justify="right", no_wrap=True)
-        table.add_row(Words("uncertainty budget", style="italic"), Words("± % of κ", style="dim"))
-        for line in sorted(document["budget"], key=lambda one: -one["of_factor"]):
-            table.add_row(line["source"], f"{100.0 * shown['coverage_factor'] * line['of_factor']:.3f}")
-        body.append(table)
-    body.append(Words(sentence(document["reason"])))
-    if document["advice"]:
-        body.append(Words(sentence(document["advice"]), style="italic"))
-    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
-    title = _TITLES[document["method"]] + (f" · {SIMULATED}" if document["simulated"] else "")
-    console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
+    shown = document["calibration_factor"] or document.get("measured_factor")
+    budget = [(line["source"], f"{100.0 * shown['coverage_factor'] * line['of_factor']:.3f}")
+              for line in sorted(document["budget"], key=lambda one: -one["of_factor"])] if shown else []
+    method = document["method"]
+    print_calibration_card(document, _TITLES[method], _CARD_ROWS[method](document), ("± % of κ",), budget, console)
 
 
 _TITLES = {PAIRS: "torque calibration by pairs", REFERENCE: "torque calibration by a reference sensor",

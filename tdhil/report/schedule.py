@@ -1,19 +1,17 @@
-"""Gains over depth, for the document, the terminal and the page; and the format of a speed or a gain."""
+"""Gains over depth, for the document, the terminal and the page; settings of the drive; format of a speed or a gain."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from rich import box
-from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from tdhil.report.blocks import Column, Picture, ReportSection, Table, Text
-from tdhil.report.console import PlainConsole
+from tdhil.report.console import PlainConsole, figures_table
 from tdhil.report.plots import plain_ticks
 from tdhil.soft_torque import (
     HIGHEST_NOISY_RPM,
@@ -47,6 +45,22 @@ def finite(values: Mapping[str, Any]) -> dict[str, Any]:
 def gain_words(value: float) -> str:
     """Return the gain with four digits, without a power of ten."""
     return f"{value:.0f}" if value >= 1e3 else f"{value:.4g}"
+
+
+def setting_words(setting: Part) -> str:
+    """Return the value of a parameter of the drive with its unit, or why there is none."""
+    return str(setting["why"]) if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
+
+
+def settings_section(settings: Iterable[tuple[str, str, str]], step: str) -> ReportSection:
+    """Return the drive's parameters with values and confidence; ``step``: what to change alone, ``value`` or
+    ``thing``.
+    """
+    return ReportSection("To be typed into the drive, by hand", (
+        Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
+        Text(f"Nothing here was written into any drive. Change one {step} at a time, at a low speed, with the "
+             "hard-wired stop in reach."),
+    ))
 
 
 def noisy_speed(part: Part) -> str:
@@ -118,12 +132,7 @@ def _worst_between(found: DepthSchedule) -> str:
 def print_schedule(document: Part, console: PlainConsole) -> None:
     """Print the table of depths and the worst case of interpolation."""
     console.print(Words(f"gains over depth, {document['kind']}, linear between rows", style="bold"))
-    grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in _headings(document):
-        grid.add_column(name, justify="right")
-    for cells in _table(document):
-        grid.add_row(*(Words(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
-    console.print(grid)
+    console.print(figures_table(_headings(document), _table(document), left=0))
     thin = any(one.get("failed") for one in document["between"])
     console.print(Words(document["sentence"], style="bold red" if thin else ""))
     for one in document["rows"]:
@@ -137,8 +146,7 @@ def schedule_section(document: Part) -> ReportSection:
     headings = _headings(document)
     rows = tuple(tuple(cell.replace("!", "⚠ ") for cell in cells) for cells in _table(document))
     parameters = tuple(
-        (f"{one['depth_m']:.0f}", setting["title"],
-         setting["why"] if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}")
+        (f"{one['depth_m']:.0f}", setting["title"], setting_words(setting))
         for one in _with_gains(document) for setting in one["drive_parameters"])
     blocks: list[Table | Text | Picture] = [
         Table(tuple(Column(name, 1.0 / len(headings), number=True) for name in headings), rows),

@@ -7,26 +7,19 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Group
-from rich.panel import Panel
-from rich.table import Table as Grid
-from rich.text import Text as Words
-
 from tdhil.report.blocks import Column, Pairs, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
-    VERDICT_STYLE,
     calibrated_item,
     date_and_signature,
     laboratory_page,
+    print_calibration_card,
     recordings,
     result_rows,
     scale_error,
     shown_degrees,
-    with_share,
 )
 from tdhil.report.card import sentence
-from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED
+from tdhil.report.console import PlainConsole
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -64,41 +57,20 @@ def speed_document(
 
 def print_speed_calibration(document: Part, console: PlainConsole) -> None:
     """Print the card of a speed calibration on a console."""
-    factor, verdict = document["calibration_factor"], document["verdict"]
-    rows = names_and_texts([("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))])
-    if factor is not None:
-        rows.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
-        rows.add_row("", f"true speed = κ · reported speed: the drive reports {scale_error(factor, 'speed')}")
-    inputs = document["inputs"]
+    factor, inputs = document["calibration_factor"], document["inputs"]
+    rows = []
     if inputs:
-        rows.add_row("counted", _counted(inputs))
+        rows.append(("counted", _counted(inputs)))
     if document["log"] is not None:
-        rows.add_row("log", Path(document["log"]["log"]).name)
-    body: list[Any] = [rows]
-    if document["budget"]:
-        body.append(_budget(document["budget"], None if factor is None else factor["coverage_factor"]))
-    body.append(Words(sentence(document["reason"])))
-    if document["advice"]:
-        body.append(Words(sentence(document["advice"]), style="italic"))
-    if factor is not None:
-        body.append(Words(sentence(_NOT_APPLIED), style="dim"))
-    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
-    title = "speed calibration" + (f" · {SIMULATED}" if document["simulated"] else "")
-    console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
-
-
-def _budget(lines: list[Part], k: float | None) -> Grid:
-    table = Grid.grid(padding=(0, 2))
-    table.add_column(style="dim")
-    for _ in range(2):
-        table.add_column(justify="right", no_wrap=True)
-    shown = "1 sd, % of κ" if k is None else "± % of κ"
-    table.add_row(Words("uncertainty budget", style="italic"), Words("1 sd", style="dim"), Words(shown, style="dim"))
-    for line in sorted(lines, key=lambda one: -one["of_factor"]):
-        unit = "" if line["unit"] == "1" else f" {line['unit']}"
-        table.add_row(line["source"], f"{line['standard_uncertainty']:.3g}{unit}",
-                      f"{100.0 * (k or 1.0) * line['of_factor']:.3f}")
-    return table
+        rows.append(("log", Path(document["log"]["log"]).name))
+    k = 1.0 if factor is None else factor["coverage_factor"]
+    budget = [(line["source"],
+               f"{line['standard_uncertainty']:.3g}" + ("" if line["unit"] == "1" else f" {line['unit']}"),
+               f"{100.0 * k * line['of_factor']:.3f}")
+              for line in sorted(document["budget"], key=lambda one: -one["of_factor"])]
+    print_calibration_card(
+        document, "speed calibration", rows, ("1 sd", "1 sd, % of κ" if factor is None else "± % of κ"), budget,
+        console, quantity="speed", remark="" if factor is None else _NOT_APPLIED)
 
 
 def _counted(inputs: Part) -> str:

@@ -11,20 +11,18 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich import box
-from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from profiles import CodedText, MessageCode, entry_of, with_code
 from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import with_interval
-from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import SIMULATED, only_finite
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import plain_ticks
-from tdhil.report.schedule import gain_words
+from tdhil.report.schedule import gain_words, setting_words, settings_section
 from tdhil.soft_torque import DriveSetting
 from tdhil.speed_loop import (
     LoopCurve,
@@ -246,24 +244,13 @@ def print_loop_tuning(document: Part, console: PlainConsole) -> None:
     console.print(Words(f"speed loop of the drive{simulated}", style="bold"))
     console.print(names_and_texts(_rests_on(document)))
     console.print()
-    grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    grid.add_column("at the motor shaft")
-    for one in document["controllers"]:
-        grid.add_column(one["kind"], justify="right")
-    for name, cells in _rows(document):
-        grid.add_row(name, *(Words(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
-    console.print(grid)
+    console.print(figures_table(("at the motor shaft", *(one["kind"] for one in document["controllers"])),
+                                ((name, *cells) for name, cells in _rows(document))))
     console.print(names_and_texts(_EXPLAINED.items(), quiet=True))
     settings = list(_setting_rows(document))
     if settings:
         console.print()
-        console.print(Words("to be typed into the drive, by hand", style="bold"))
-        own = Grid.grid(padding=(0, 2))
-        own.add_column(overflow="fold")
-        own.add_column(overflow="fold")
-        for title, value, sure in settings:
-            own.add_row(title, f"{value} ({sure})")
-        console.print(own)
+        print_settings(settings, console)
     if document["notch_by_hand"] is not None:
         console.print()
         console.print(Words(document["notch_by_hand"]))
@@ -349,8 +336,7 @@ def _ends(part: Part, times: float = 1.0) -> str:
 def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
     """Yield (parameter, value to enter, confidence), of the tuned gains."""
     for one in document["controllers"][-1]["drive_parameters"]:
-        value = one["why"] if one["value"] is None else f"{gain_words(one['value'])} {one['unit']}"
-        yield one["title"], value, one["confidence"]
+        yield one["title"], setting_words(one), one["confidence"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -454,11 +440,7 @@ def loop_report(document: Part) -> Report:
     ]
     settings = list(_setting_rows(document))
     if settings:
-        sections.append(ReportSection("To be typed into the drive, by hand", (
-            Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
-            Text("Nothing here was written into any drive. Change one value at a time, at a low speed, with the "
-                 "hard-wired stop in reach."),
-        )))
+        sections.append(settings_section(settings, "value"))
     if document["notch_by_hand"] is not None:
         sections.append(ReportSection("Notch filter, to be set by hand", (Text(document["notch_by_hand"]),)))
     tuned_for = document["tuned_for"]

@@ -9,17 +9,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Group
-from rich.panel import Panel
-from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from tdhil.report.blocks import Block, Column, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
-    VERDICT_STYLE,
     calibrated_item,
     date_and_signature,
     laboratory_page,
+    print_calibration_card,
     quantity,
     recordings,
     result_rows,
@@ -28,9 +25,8 @@ from tdhil.report.calibration_page import (
     shown_degrees,
     with_share,
 )
-from tdhil.report.card import plus_minus, sentence
-from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED
+from tdhil.report.card import plus_minus
+from tdhil.report.console import PlainConsole
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
 
@@ -86,47 +82,24 @@ def calibration_document(
 
 def print_calibration(document: Part, console: PlainConsole) -> None:
     """Print the card of a torque calibration on a console."""
-    rows = names_and_texts(())
-    verdict = document["verdict"]
-    rows.add_row("verdict", Words(verdict, style=VERDICT_STYLE.get(verdict, "bold")))
     factor, inertia = document["calibration_factor"], document["inertia_kg_m2"]
-    if factor is not None:
-        rows.add_row("calibration factor", Words(with_share(factor, ""), style="bold"))
-        rows.add_row("", f"true torque = κ · reported torque: the drive reports {scale_error(factor)}")
+    rows: list[tuple[str, str | Words]] = []
     if inertia is not None:
-        rows.add_row("J without the body", Words(with_share(inertia, "kg·m²"), style="bold"))
+        rows.append(("J without the body", Words(with_share(inertia, "kg·m²"), style="bold")))
     for run in document["runs"]:
         text = f"{run_name(run)}: {run['added_kg_m2']:.4g} kg·m² added"
         if "reported_kg_m2" in run:
             text += f", identified {plus_minus(run['reported_kg_m2'], 2.0 * run['standard_uncertainty_kg_m2'])}"
-        rows.add_row("run", text)
+        rows.append(("run", text))
     for name, key in (("straight line", "linearity"), ("filters shared", "sharing")):
         if document[key] is not None:
-            rows.add_row(name, f"p = {document[key]['p_value']:.2g}")
-    body: list[Any] = [rows]
-    if factor is not None and document["budget"]:
-        body.append(_budget(document))
-    body.append(Words(sentence(document["reason"])))
-    if document["advice"]:
-        body.append(Words(sentence(document["advice"]), style="italic"))
-    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
-    title = "torque calibration" + (f" · {SIMULATED}" if document["simulated"] else "")
-    console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
-
-
-def _budget(document: Part) -> Grid:
-    """Return each input quantity's contribution to κ and to J, at the coverage factor of the result."""
-    k_factor, k_inertia = (document[key]["coverage_factor"] for key in ("calibration_factor", "inertia_kg_m2"))
-    table = Grid.grid(padding=(0, 2))
-    table.add_column(style="dim")
-    for _ in range(2):
-        table.add_column(justify="right", no_wrap=True)
-    table.add_row(Words("uncertainty budget", style="italic"), Words("± % of κ", style="dim"),
-                  Words("± % of J", style="dim"))
-    for line in sorted(document["budget"], key=lambda one: -one["of_inertia"]):
-        table.add_row(line["source"], f"{100.0 * k_factor * line['of_factor']:.2f}",
-                      f"{100.0 * k_inertia * line['of_inertia']:.2f}")
-    return table
+            rows.append((name, f"p = {document[key]['p_value']:.2g}"))
+    # each input quantity's contribution to κ and to J, at the coverage factor of the result
+    budget = [] if factor is None else [
+        (line["source"], f"{100.0 * factor['coverage_factor'] * line['of_factor']:.2f}",
+         f"{100.0 * inertia['coverage_factor'] * line['of_inertia']:.2f}")
+        for line in sorted(document["budget"], key=lambda one: -one["of_inertia"])]
+    print_calibration_card(document, "torque calibration", rows, ("± % of κ", "± % of J"), budget, console)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -8,17 +8,23 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from rich import box
-from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import with_interval
-from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import SIMULATED
 from tdhil.report.operator_map import map_section, print_map
-from tdhil.report.schedule import finite, gain_words, noisy_speed, print_schedule, schedule_section, spread_document
+from tdhil.report.schedule import (
+    finite,
+    gain_words,
+    noisy_speed,
+    print_schedule,
+    schedule_section,
+    settings_section,
+    spread_document,
+)
 from tdhil.soft_torque import (
     BAND_HZ,
     HIGHEST_NOISY_RPM,
@@ -314,14 +320,8 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     console.print(Words(f"speed controller for {_string_words(document)}{simulated}", style="bold"))
     console.print(names_and_texts(_rests_on(document)))
     console.print()
-    grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    grid.add_column("")
-    taken = [one for one in document["controllers"] if not one["refused"]]
-    for one in taken:
-        grid.add_column(one["kind"], justify="right")
-    for name, cells in _rows(document):
-        grid.add_row(name, *(Words(cell[1:], style="bold red") if cell.startswith("!") else cell for cell in cells))
-    console.print(grid)
+    console.print(figures_table(("", *(one["kind"] for one in document["controllers"] if not one["refused"])),
+                                ((name, *cells) for name, cells in _rows(document))))
     if document.get("schedule"):
         print_schedule(document["schedule"], console)
     if document.get("map"):
@@ -332,13 +332,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
             console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))
     settings = list(_setting_rows(document))
     if settings:
-        console.print(Words("to be typed into the drive, by hand", style="bold"))
-        own = Grid.grid(padding=(0, 2))
-        own.add_column(overflow="fold")
-        own.add_column(overflow="fold")
-        for title, values, sure in settings:
-            own.add_row(title, f"{values} ({sure})")
-        console.print(own)
+        print_settings(settings, console)
         console.print()
     for warning in document["warnings"]:
         console.print(Words(warning, style="yellow"))
@@ -518,11 +512,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         sections.append(map_section(document["map"], document["string"]["bit"]["words"]))
     settings = list(_setting_rows(document))
     if settings:
-        sections.append(ReportSection("To be typed into the drive, by hand", (
-            Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
-            Text("Nothing here was written into any drive. Change one thing at a time, at a low speed, with the "
-                 "hard-wired stop in reach."),
-        )))
+        sections.append(settings_section(settings, "thing"))
     if document.get("schedule"):
         sections.append(schedule_section(document["schedule"]))
     rests: list[tuple[str, str]] = list(_rests_on(document))

@@ -21,11 +21,11 @@ from tdhil.report.blocks import (
     Report,
     ReportSection,
     Table,
-    reference_of,
+    report_of_run,
     shown_date,
 )
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import banner, marks, only_finite, rehearsal_rows, run_facts
+from tdhil.report.document import marks, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET
@@ -158,17 +158,9 @@ def verification_report(document: Part, sha256: str = "") -> Report:
             *((("SHA-256", sha256),) if sha256 else ()))),)),
     ]
     facts = [(document["rig"] or {}).get("name"), shown_date(document["date"])]
-    return Report(
-        title="Speed loop of the drive, verified",
-        subtitle=" · ".join(fact for fact in facts if fact),
-        simulated=banner(document),
-        answer=AnswerBox(_COLOURS.get(verdict, "red"), verdict.replace("_", " ").capitalize(), (),
-                         _VERDICTS[verdict], f"{document['reason']}.", document["next_step"]),
-        warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
-        sections=tuple(sections),
-        footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
-        reference=reference_of(document),
-    )
+    answer = AnswerBox(_COLOURS.get(verdict, "red"), verdict.replace("_", " ").capitalize(), (), _VERDICTS[verdict],
+                       f"{document['reason']}.", document["next_step"])
+    return report_of_run(document, "Speed loop of the drive, verified", facts, answer, sections, sha256)
 
 
 def draw_verification(figure: FigureBase, document: Part) -> None:
