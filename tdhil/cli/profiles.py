@@ -23,7 +23,7 @@ from tdhil.buses import (
 from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
-from tdhil.errors import ExitCode, existing_file
+from tdhil.errors import ExitCode, MessageCode, existing_file
 from tdhil.session import UNVERIFIED_FLAG, doubtful
 
 if TYPE_CHECKING:
@@ -262,7 +262,7 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
         raise existing_file(target) from None
     except OSError as error:
         message = f"can't be written ({error.strerror or error}); name another path with -o"
-        raise DataFileError((Problem(str(target), 0, message),)) from error
+        raise DataFileError((Problem(str(target), 0, message),), entry=MessageCode.FILE_NOT_WRITABLE) from error
     open_entries = [name for name, entry in doubtful(begun.profile) if entry.confidence == "unverified"]
     if as_json:
         print_json({"file": str(target), "profile": row(begun.profile), "unverified": open_entries})

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tdhil.errors import UsageError
+from tdhil.errors import MessageCode, UsageError
 from tdhil.session.run_record import RunRecord
 from tdhil.session.stored_calibration import load_calibration, other_drive, save_calibration
 
@@ -133,7 +133,8 @@ def add_speed_calibration(document: Mapping[str, Any], path: Path) -> bool:
         save_calibration({**kept, SECTION: dict(document)}, beside)
         beside.replace(path)
     except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}") from error
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
     finally:
         beside.unlink(missing_ok=True)
     return bool(drive and kept.get("drive"))

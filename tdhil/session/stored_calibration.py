@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers import PreflightRefused
-from tdhil.errors import UsageError, existing_file
+from tdhil.errors import MessageCode, UsageError, existing_file
 
 if TYPE_CHECKING:
     from tdhil.calibration import StoredCalibration
@@ -51,7 +51,8 @@ def save_calibration(document: Mapping[str, Any], path: Path) -> None:
     except FileExistsError:
         raise existing_file(f"--save {path}") from None
     except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}") from error
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from error
 
 
 def calibration_of_rig(rig: Rig | None) -> dict[str, Any] | None:

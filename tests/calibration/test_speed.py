@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -164,6 +165,21 @@ def test_the_file_has_a_section_and_keeps_the_torque(tmp_path, capsys):
     refused = tmp_path / "refused.json"
     assert main(["calibrate", "speed", *COUNTED, "--want", "0.01%", "--save", str(refused)]) == 9
     assert not refused.exists()
+
+
+def test_a_file_that_cannot_be_written_has_its_code(tmp_path, capsys, monkeypatch):
+    assert main(["calibrate", "speed", *COUNTED, "--save", str(tmp_path / "no" / "speed.json")]) == 2
+    assert "can't be written" in (err := capsys.readouterr().err) and "TDH-206" in err
+    kept = tmp_path / "calibration.json"
+    kept.write_text(json.dumps(TORQUE))
+
+    def refused(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "replace", refused)
+    assert main(["calibrate", "speed", *COUNTED, "--save", str(kept)]) == 2
+    assert "can't be written" in (err := capsys.readouterr().err) and "TDH-206" in err
+    assert json.loads(kept.read_text()) == TORQUE and [one.name for one in tmp_path.iterdir()] == ["calibration.json"]
 
 
 @pytest.mark.parametrize(("text", "words"), [("no JSON", "is no JSON"), ("{}", "no calibration"),

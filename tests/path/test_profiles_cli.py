@@ -194,7 +194,7 @@ def test_a_broken_eds_is_a_line_and_no_profile(tmp_path, content, at):
 
 
 @pytest.mark.parametrize(("output", "words"), [
-    ("mine.txt", "must end in .yaml"), ("no/such/mine.yaml", "can't be written"),
+    ("mine.txt", "must end in .yaml"), ("no/such/mine.yaml", "can't be written"), ("no/such/mine.yaml", "TDH-206"),
 ])
 def test_where_a_profile_cannot_go(tmp_path, output, words):
     done = tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", tmp_path / output)
