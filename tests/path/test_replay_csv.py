@@ -237,7 +237,7 @@ def test_the_page_s_examples_do_what_it_says(tmp_path, monkeypatch):
     excitation, levels = load_excitation(Path("excitation.yaml"), np.array([0.0, 300.0]))
     assert [segment.end_s for segment in excitation.segments] == [152.0, 300.0]
     assert levels == ()
-    commands = re.findall(r"^tdhil (.*)$", text, re.MULTILINE)
+    commands = re.findall(r"^tdhil (replay .*)$", text, re.MULTILINE)
     assert len(commands) == 4
     for command in commands[:3]:
         done = tdhil(*shlex.split(command), "--json")

@@ -791,7 +791,7 @@ def test_a_new_row_of_the_table_is_a_field_with_its_name_unit_default_help_and_l
     page = client.get("/start/a").text
     (field,) = re.findall(r'<div class="field"><label data-flag="--dwell".*?</div>', page, re.DOTALL)
     assert re.search(r'<input name="dwell_hz" placeholder="default: 2.5"[^>]*data-unit="Hz"', field)
-    assert '<label data-flag="--dwell" data-label="Dwell, Hz">Dwell, Hz<input' in field
+    assert '<label data-flag="--dwell" data-label="Dwell, Hz"><span>Dwell, Hz</span>\n<input' in field
     assert 'aria-describedby="about-dwell_hz"' in field
     assert '<small id="about-dwell_hz" class="dim">Pause, or 2.5; at least 0.5 Hz and below 7 Hz.</small>' in field
 
