@@ -145,14 +145,19 @@ class TorqueAtLimit:
 
 
 class FlatSpeed:
-    """Rule: a reported speed stays within its noise while torque should have moved it."""
+    """Rule: a reported speed stays within its noise while torque should have moved it.
+
+    The load is a torque that acted within a lag after the speed became flat. The torque of the first point alone may be
+    the end of a pulse that the speed has answered already.
+    """
 
     def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
         self._limits = limits
         self._still_rad_s = still_rad_s
         self._lag_s = lag_s
         self._since_s: float | None = None
-        self._low = self._high = self._least = self._most = self._began = self._moved = self._seen_s = 0.0
+        self._low = self._high = self._least = self._most = self._load_low = self._load_high = 0.0
+        self._impulse_nms = self._from_s = self._seen_s = 0.0
         self._strained_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
@@ -176,8 +181,8 @@ class FlatSpeed:
         if self._since_s is None or high - low > noise_rad_s:
             self._since_s = self._seen_s = point.time_s
             self._low = self._high = point.speed
-            self._least = self._most = self._began = torque
-            self._moved = self._strained_s = 0.0
+            self._count_from(point.time_s, torque)
+            self._strained_s = 0.0
             return 0.0
         took_s, self._seen_s = point.time_s - self._seen_s, point.time_s
         self._low, self._high = low, high
@@ -185,15 +190,25 @@ class FlatSpeed:
         self._strained_s = self._strained_s + took_s if _strained(point, self._limits) else 0.0
         for_s = point.time_s - self._since_s
         if command.mode is Mode.SPEED:
-            self._began, self._least, self._most, self._moved = torque, torque, torque, 0.0
+            self._count_from(point.time_s, torque)
             return for_s if self._strained_s >= FLAT_LIMIT_S else 0.0
-        self._moved += took_s * (torque - self._began)
+        self._impulse_nms += took_s * torque
+        counted_s = point.time_s - self._from_s
+        if counted_s <= self._lag_s:
+            self._load_low, self._load_high = min(self._load_low, torque), max(self._load_high, torque)
         if not now.bounds.known or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
             return 0.0
         moves = FLAT_MOVES * noise_rad_s
-        by_inertia = abs(self._moved) / now.bounds.inertia_high
+        unbalanced_nms = max(
+            0.0, self._impulse_nms - counted_s * self._load_high, counted_s * self._load_low - self._impulse_nms)
+        by_inertia = unbalanced_nms / now.bounds.inertia_high
         by_string = (self._most - self._least) / now.bounds.string_nm_s_rad
         return for_s if min(by_inertia, by_string) >= moves else 0.0
+
+    def _count_from(self, time_s: float, torque_nm: float) -> None:
+        """Begin the range and the impulse of the torque anew."""
+        self._from_s, self._impulse_nms = time_s, 0.0
+        self._least = self._most = self._load_low = self._load_high = torque_nm
 
 
 class IgnoredYield:
