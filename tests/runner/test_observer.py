@@ -435,13 +435,21 @@ def test_a_position_that_lives_stands_in_for_a_lost_speed():
     assert bench.observer.reports_trusted
     sample = bench.samples[-1]
     assert abs(bench.observer.speed_rad_s(sample)) < 0.05 and bench.observer.angle_quiet(0.05)
+    assert bench.observer.angle_stands(0.05)
+    assert not bench.observer.angle_stands(1e-6)               # one count of this position is more
+
+
+def test_a_shaft_without_a_position_has_none_that_stands():
+    bench = Bench(PLAIN).begun()
+    bench.quick_stop(8.0)
+    assert bench.observer.angle_quiet(0.05) and not bench.observer.angle_stands(0.05)
 
 
 def test_a_position_that_goes_on_is_no_standstill():
     bench = Bench(WITH_POSITION).begun()
     bench.lie = JUMPS["lost"]
     bench.hold(2.0, 5.0)
-    assert not bench.observer.angle_quiet(0.05)
+    assert not bench.observer.angle_quiet(0.05) and not bench.observer.angle_stands(0.05)
 
 
 @pytest.mark.parametrize("left", [0.1, 0.4])

@@ -18,6 +18,7 @@ class Observed:
 
     reports_trusted: bool = True
     position_quiet: bool = True
+    position_stands: bool = False          # with a position that resolves the standstill speed
     blind_s: float = 0.0
     unseen_s: float = 0.0
     coasts_s: float = 0.0
@@ -34,6 +35,10 @@ class Observed:
     def angle_quiet(self, at_rest_rad_s):
         assert at_rest_rad_s == AT_REST
         return self.position_quiet
+
+    def angle_stands(self, at_rest_rad_s):
+        assert at_rest_rad_s == AT_REST
+        return self.position_stands
 
 
 def sample(time_s, speed=0.0, state=PowerState.QUICK_STOP, standstill=True):
@@ -123,7 +128,14 @@ def test_single_counts_of_noise_do_not_hide_standstill(every, factor, rests):
     assert rests_with(every, factor) is rests
 
 
-@pytest.mark.parametrize("observed", [Observed(doubt="speed"), Observed(position_quiet=False)])
+@pytest.mark.parametrize(("every", "rests"), [(20, True), (9, False)])
+def test_a_position_that_stands_shows_that_a_larger_count_is_noise(every, rests):
+    assert rests_with(every, 3.0, Observed(position_stands=True)) is rests
+
+
+@pytest.mark.parametrize("observed", [
+    Observed(doubt="speed"), Observed(position_quiet=False), Observed(doubt="speed", position_stands=True),
+])
 def test_after_a_contradiction_or_with_a_position_that_moves_no_count_is_noise(observed):
     assert not rests_with(20, 1.05, observed)
 

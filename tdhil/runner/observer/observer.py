@@ -301,6 +301,11 @@ class Observer:
         rate = self.rate_rad_s
         return rate is None or abs(rate) <= min(at_rest_rad_s, STANDSTILL_ANGLE_RAD_S) + self._angles.blur_rad_s
 
+    def angle_stands(self, at_rest_rad_s: float) -> bool:
+        """Return whether there is a position that resolves this speed, rad/s, and shows standstill."""
+        fine = self.rate_rad_s is not None and self._angles.blur_rad_s <= at_rest_rad_s
+        return fine and self.angle_quiet(at_rest_rad_s)
+
     @property
     def _braked(self) -> bool:
         """Return whether the reported torque stopped the shaft after the drive left operation.
