@@ -185,6 +185,10 @@ class MessageCode(Enum):
         61, "The coupling behind the motor has backlash",
         "The load changes its flank when the torque on it reverses; the motor then turns by the play without the load.",
         "Check the coupling and the gear, or raise --offset so that the torque on the load keeps its sign.")
+    SCALE_CHANGE_HIDDEN = (
+        62, "A change of scale may stay hidden",
+        "Above this drill string no cross-check can be compared with J.",
+        "Repeat the run and compare the two results.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from profiles import MessageCode
-from tdhil.estimation import Verdict, identify
+from tdhil.estimation import Options, Verdict, identify
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.cross_checks import cross_checked
 from tdhil.estimation.cross_checks.level_torque import LEAST, MOST, level_contradiction, level_torques
+from tdhil.estimation.result import Compliant, Estimate
 from tdhil.estimation.samples import usable_samples
 from tests.estimation.stages_bench import Stages, run_stages
 
@@ -54,6 +57,20 @@ def test_such_a_run_has_no_inertia(recorded):
     found = identify(scaled_in_stage_5(recorded[1], 0.5))
     assert found.inertia is None
     assert found.verdict is Verdict.MODEL_REJECTED
+
+
+def test_above_a_string_of_unknown_inertia_the_result_states_what_stays_hidden(recorded):
+    recording = replace(recorded[0], has_drill_string=True)
+    case = Case(recording, Options(), samples=usable_samples(recording))
+    part = Finding(model="string", inertia=Estimate(104.0, 102.0, 106.0), compliant=Compliant(None, None, None, None, None, None))
+    checked = cross_checked(part, case)
+    ratios = [one.ratio for one in level_torques(recording, case.samples)]
+    seen = min(max(ratio / LEAST, MOST / ratio) for ratio in ratios) - 1.0
+    assert [one.entry for one in checked.warnings] == [MessageCode.SCALE_CHANGE_HIDDEN]
+    assert f"of less than {seen:.0%}" in checked.warnings[0]
+    assert checked.second_opinions[0].least_scale_change == pytest.approx(seen)
+    rigid = cross_checked(part, replace(case, recording=recorded[0]))
+    assert rigid.warnings == () and rigid.second_opinions[0].least_scale_change is None
 
 
 def test_one_level_or_none_says_nothing(recorded):

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from profiles import MessageCode
 from tdhil.estimation import Verdict, identify
 from tdhil.estimation.cross_checks.speed_jump import MOST, jump_contradiction
+from tdhil.recording import Stage
 from tests.estimation.compliant_bench import Pipe, run
 from tests.estimation.test_two_mass import KNOWN, MILD
 
@@ -61,12 +62,23 @@ def test_a_single_false_report_is_no_jump(recorded):
     assert jump_contradiction(lone, 0.95 * PLANT.motor, PLANT.motor) is None
 
 
-def test_speed_mode_a_gap_and_an_open_side_say_nothing(recorded):
-    changed = rescaled(recorded, 2.0)
-    assert jump_contradiction(replace(changed, commanded_torque_nm=None), PLANT.motor, PLANT.motor) is None
-    none = np.full(len(changed.time_s), np.nan)
-    assert jump_contradiction(replace(changed, commanded_torque_nm=none), PLANT.motor, PLANT.motor) is None
+@pytest.mark.parametrize(("factor", "command"), [(0.3, True), (0.5, None)])
+def test_in_speed_mode_the_reported_torque_bounds_the_true_one(recorded, factor, command):
+    in_speed_mode = replace(recorded, commanded_torque_nm=command and np.full(len(recorded.time_s), np.nan))
+    assert jump_contradiction(in_speed_mode, 0.8 * PLANT.motor, PLANT.motor) is None
+    inertia = PLANT.motor / factor                           # what such a run identifies
+    assert jump_contradiction(rescaled(in_speed_mode, factor), 0.95 * inertia, inertia) is not None
+
+
+def test_nothing_is_said_without_a_command_and_a_torque_limit(recorded):
+    in_speed_mode = replace(rescaled(recorded, 2.0), commanded_torque_nm=None, torque_limit_nm=None)
+    assert jump_contradiction(in_speed_mode, PLANT.motor, PLANT.motor) is None
     assert MOST < 1.0
+
+
+def test_a_jump_after_stage_5_is_not_searched(recorded):
+    ended = Stage("acquire", 0.0, AT_S - 1.0, "ok", "")
+    assert jump_contradiction(replace(rescaled(recorded, 2.0), stages=(ended,)), PLANT.motor, PLANT.motor) is None
 
 
 @pytest.mark.heavy

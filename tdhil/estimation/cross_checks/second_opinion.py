@@ -20,6 +20,7 @@ from profiles.quantities import printed_interval
 from tdhil.config import has_plateaus
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_curve
+from tdhil.estimation.cross_checks.level_torque import LEAST, MOST, level_torques
 from tdhil.estimation.cross_checks.momentum import BalanceKind, Balances, balances
 from tdhil.estimation.cross_checks.momentum_fit import (
     UNKNOWN_DELAY,
@@ -69,6 +70,11 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
         least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / len(against)) * half / reference.value)
         note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
         opinions = (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
+    elif case.recording.has_drill_string and finding.inertia and all(one.agrees is None for one in opinions):
+        hidden, warning = _hidden_change(case)
+        warnings = (*warnings, warning)
+        if opinions and hidden is not None:
+            opinions = (replace(opinions[0], least_scale_change=hidden), *opinions[1:])
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, confidence)
     if contradiction.reason:
@@ -155,6 +161,19 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 "the run", entry=MessageCode.METHODS_CONTRADICT,
             )
     return Refusal("", "")
+
+
+def _hidden_change(case: Case) -> tuple[float | None, CodedText]:
+    """Return the least change of the torque scale that the mean torques show, and the warning of a smaller one.
+
+    For a run above a string, if no momentum balance can be compared with J.
+    """
+    ratios = [one.ratio for one in level_torques(case.recording, case.samples) if one.ratio > 0.0]
+    least = min((max(ratio / LEAST, MOST / ratio) - 1.0 for ratio in ratios), default=None)
+    amount = "" if least is None else f" of less than {least:.0%}"
+    return least, CodedText(
+        f"this run does not show a change{amount} in the scale of torque or speed. If a scale changed, J has an error "
+        "of that size", MessageCode.SCALE_CHANGE_HIDDEN)
 
 
 def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:
