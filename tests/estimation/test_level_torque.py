@@ -62,7 +62,8 @@ def test_such_a_run_has_no_inertia(recorded):
 def test_above_a_string_of_unknown_inertia_the_result_states_what_stays_hidden(recorded):
     recording = replace(recorded[0], has_drill_string=True)
     case = Case(recording, Options(), samples=usable_samples(recording))
-    part = Finding(model="string", inertia=Estimate(104.0, 102.0, 106.0), compliant=Compliant(None, None, None, None, None, None))
+    shaft = Compliant(None, None, None, None, None, None)
+    part = Finding(model="string", inertia=Estimate(104.0, 102.0, 106.0), compliant=shaft)
     checked = cross_checked(part, case)
     ratios = [one.ratio for one in level_torques(recording, case.samples)]
     seen = min(max(ratio / LEAST, MOST / ratio) for ratio in ratios) - 1.0
