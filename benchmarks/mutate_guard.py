@@ -103,8 +103,9 @@ SUBJECTS = {
     **{
         f"observer/{name}": _run(f"observer/{name}", "test_observer.py", "test_standstill.py")
         for name in ("observer", "momentum_balance", "position_way", "repeated_feedback", "revival", "runaway",
-                     "shaft_bounds", "torque_following", "unanswered_torque")
+                     "shaft_bounds", "torque_following")
     },
+    "observer/unanswered_torque": _run("observer/unanswered_torque", "test_unanswered_torque.py", "test_observer.py"),
     "observer/left_operation": _run("observer/left_operation", "test_left_operation.py", "test_stop_doubt.py"),
     "standstill": _run("standstill", "test_standstill.py", "test_stop_feedback.py"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),

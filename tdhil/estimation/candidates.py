@@ -137,7 +137,9 @@ CANDIDATES: tuple[CandidateModel, ...] = (
     ),
     CandidateModel(
         SCALED_PIPE, FitRoute.LOAD, model="string with the travel time of the pipe and a free impedance",
-        data="the same lines", prior="the travel time of the pipe", tried="the data contradict the pipe",
+        data="the same lines", prior="the travel time of the pipe",
+        tried="the data contradict the pipe, or as a test of a pipe that they allow: it then counts if it explains more"
+              " than chance does (p of 0.001)",
         stands="never; at 0.75 to 1.33 times the impedance the pipe is left out with a warning, beyond that J does not"
                " stand",
         interval="none",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pytest
 
 from drivers import Mode, PowerState, Sample
-from tdhil.runner.standstill import Standstill
+from tdhil.runner.standstill import CountsOfNoise, Standstill
 
 AT_REST, SETTLE_S, GAP_S, PERIOD_S = 0.05, 1.5, 0.2, 0.02
 
@@ -138,6 +138,21 @@ def test_a_position_that_stands_shows_that_a_larger_count_is_noise(every, rests)
 ])
 def test_after_a_contradiction_or_with_a_position_that_moves_no_count_is_noise(observed):
     assert not rests_with(20, 1.05, observed)
+
+
+def test_a_count_of_noise_itself_is_no_standstill():
+    last = round(SETTLE_S / PERIOD_S) + 1                       # the sample that would end it
+    seen_s = at_seconds(4.0, (last, sample(last * PERIOD_S, speed=1.05 * AT_REST)))
+    assert seen_s == pytest.approx((last + 1) * PERIOD_S)
+
+
+def test_a_quiet_sample_needs_no_explanation_after_a_contradiction_or_many_counts():
+    for observed, counts in ((Observed(doubt="speed"), 0), (Observed(), 50)):
+        noise = CountsOfNoise(observed, AT_REST)
+        for _ in range(counts):
+            noise.explains(1.05 * AT_REST, quiet=False)
+        assert noise.explains(0.0, quiet=True)
+        assert not noise.explains(1.05 * AT_REST, quiet=False)
 
 
 def test_a_single_lost_frame_does_not():

@@ -196,7 +196,11 @@ def _try_pipe(standing: _LoadWalk) -> _LoadWalk:
     near = standing.fitted(TwoMassShaft())
     known = standing.fitted(KnownStringShaft(standing.pipe), near)
     if not rejects(known.residual) and plausible(known):
-        return replace(standing, chosen=Chosen(known, pipe=standing.pipe), ended=True)
+        # few lines with undocumented filters may hide a wrong impedance in their residuals
+        scaled, ratio = _scaled_pipe(standing, near)
+        if not _likeliest(known) - _likeliest(scaled) > chance_gain():
+            ratio = None
+        return replace(standing, chosen=Chosen(known, pipe=standing.pipe, impedance_ratio=ratio), ended=True)
     return replace(standing.with_pipe(None), near=near, contradicted=True)
 
 
@@ -233,14 +237,23 @@ def _try_string(standing: _LoadWalk) -> _LoadWalk:
 
 def _try_scaled_pipe(standing: _LoadWalk) -> _LoadWalk:
     """Compare the impedance of a string with the travel time of the contradicted pipe to that of the pipe."""
-    assert standing.pipe is not None and isinstance(standing.chosen, Chosen)
+    assert isinstance(standing.chosen, Chosen)
+    _, ratio = _scaled_pipe(standing, standing.near)
+    return replace(standing, chosen=replace(standing.chosen, other_pipe=True, impedance_ratio=ratio))
+
+
+def _scaled_pipe(standing: _LoadWalk, near: CompliantFit | None) -> tuple[CompliantFit, float | None]:
+    """Return the string with the pipe's travel time and a free impedance, and its ratio to that of the pipe.
+
+    The ratio is None within its allowed range, or if that string is contradicted, too.
+    """
+    assert standing.pipe is not None
     scaled = KnownStringShaft(standing.pipe, _ANY_IMPEDANCE)
-    fit = standing.fitted(scaled, standing.near)
+    fit = standing.fitted(scaled, near)
     ratio = scaled.impedance_ratio(fit.mechanical)
     least, most = _PIPE_RATIOS
     found = not rejects(fit.residual) and plausible(fit) and not least <= ratio <= most
-    return replace(
-        standing, chosen=replace(standing.chosen, other_pipe=True, impedance_ratio=ratio if found else None))
+    return fit, ratio if found else None
 
 
 # Near the antiresonance the motor nearly stands still and the load oscillates most, possibly faster than the mean
