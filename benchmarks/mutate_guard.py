@@ -345,6 +345,12 @@ EQUIVALENT = {
     "stop.py, _coast: return None (last)": _FALLS_THROUGH,
     "stop.py, _gets_slower: return False (last)": _FALLS_THROUGH,
     "stop.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
+    "observer/unanswered_torque.py, __init__: self._impulse_nms = self._from_s = self._seen_s = 0.0":
+        "the first point sets them",
+    "observer/unanswered_torque.py, __init__: self._strained_s = 0.0 (last)": "the first point of each rule sets it",
+    "observer/unanswered_torque.py, see: return None":
+        "after the rows are cleared, a single point is younger than the time of a yield",
+    "standstill.py, see: return False": "the time since this sample is 0, below the time to settle",
     **{f"{name}.py, module: {line}": _A_PROCESS for name in ("service/run_process", "service/drive_stop")
        for line in ("if __name__ == '__main__':", "sys.exit(main(sys.argv[1:]))")},
     **{f"{name}.py, module: Say = Callable[[str], None]": _FOR_MYPY

@@ -1,5 +1,6 @@
 """A reported speed that does not respond to the torque, above a drill string: rules of the observer, point by point."""
 
+import math
 from collections import deque
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,26 +8,44 @@ from types import SimpleNamespace
 import pytest
 
 from drivers import Command, Mode
-from tdhil.runner.observer.unanswered_torque import FlatSpeed, PointInRun
+from tdhil.runner.observer.unanswered_torque import (
+    FLAT_LIMIT_S,
+    HELD_S,
+    STRAINED_S,
+    YIELD_S,
+    FlatSpeed,
+    HeldShaft,
+    IgnoredYield,
+    PointInRun,
+    TorqueAtLimit,
+    rules,
+)
 from tests.rigs import LIMITS
 
 STRING = replace(LIMITS, load="string", torque_ramp_nm_s=0.1 * LIMITS.torque_nm)
 EVERY_S, LAG_S, NOISE_RAD_S, STILL_RAD_S = 0.1, 0.5, 0.01, 0.05
-INERTIA_KG_M2, STRING_NM_S_RAD, HOLDING_NM = 100.0, 200.0, 150.0
+INERTIA_KG_M2, STRING_NM_S_RAD, HOLDING_NM, BREAKAWAY_NM = 100.0, 200.0, 150.0, 20.0
+LIMIT_NM, FASTEST_RAD_S = STRING.torque_nm, STRING.speed_max_rad_s
 
 
-def found(torque_of, speed_of=lambda _: 4.0, until_s=6.0, mode=Mode.TORQUE):
+def first(rule, torque_of, speed_of, until_s, command_of, *, known=True, moved=True, stopping=False):
     """Return the time of the first contradiction, s, and None without one."""
-    rule = FlatSpeed(STRING, STILL_RAD_S, LAG_S)
-    bounds = SimpleNamespace(known=True, inertia_high=INERTIA_KG_M2, string_nm_s_rad=STRING_NM_S_RAD)
+    bounds = SimpleNamespace(
+        known=known, inertia_high=INERTIA_KG_M2, string_nm_s_rad=STRING_NM_S_RAD, breakaway_nm=BREAKAWAY_NM)
+    points = deque()
     for k in range(round(until_s / EVERY_S)):
         time_s = k * EVERY_S
-        torque_nm = torque_of(time_s)
-        point = SimpleNamespace(time_s=time_s, torque=torque_nm, speed=speed_of(time_s))
-        now = PointInRun(point, Command(mode, 4.0, torque_nm), EVERY_S, deque(), bounds, NOISE_RAD_S, True, False)
+        points.append(SimpleNamespace(time_s=time_s, torque=torque_of(time_s), speed=speed_of(time_s)))
+        now = PointInRun(points[-1], command_of(time_s), EVERY_S, points, bounds, NOISE_RAD_S, moved, stopping)
         if rule.see(now) is not None:
             return time_s
     return None
+
+
+def found(torque_of, speed_of=lambda _: 4.0, until_s=6.0, mode=Mode.TORQUE):
+    """Return the time at which a flat speed is found, s."""
+    return first(FlatSpeed(STRING, STILL_RAD_S, LAG_S), torque_of, speed_of, until_s,
+                 lambda time_s: Command(mode, 4.0, torque_of(time_s)))
 
 
 def test_a_speed_that_a_torque_should_have_moved_is_found():
@@ -53,3 +72,124 @@ def test_a_speed_that_is_lost_within_a_pulse_is_found_by_the_next_torque():
         return -HOLDING_NM if time_s < 0.35 else HOLDING_NM if time_s < 3.0 else 3.0 * HOLDING_NM
 
     assert found(torque_of, until_s=9.0) is not None
+
+
+def test_a_torque_that_falls_is_noticed_as_one_that_rises():
+    assert found(lambda time_s: 2.0 * HOLDING_NM if time_s < 1.0 else 0.5 * HOLDING_NM) is not None
+
+
+def test_a_speed_that_leaves_its_noise_in_both_directions_together_has_answered():
+    """Each speed is within the noise of the first one, and the highest is not within the noise of the lowest."""
+    steps = (0.0, 1.6 * NOISE_RAD_S, -1.6 * NOISE_RAD_S)
+
+    def speed_of(time_s):
+        return 4.0 + steps[round(time_s / EVERY_S) % 3]
+
+    assert found(lambda time_s: HOLDING_NM if time_s < 1.0 else 2.0 * HOLDING_NM, speed_of) is None
+
+
+def test_after_an_answer_the_balance_begins_anew():
+    def torque_of(time_s):
+        return HOLDING_NM if time_s < 4.95 else 4.0 * HOLDING_NM + 60.0 * math.cos(2.0 * math.pi * (time_s - 5.0))
+
+    assert found(torque_of, lambda time_s: 4.0 if time_s < 4.95 else 5.0, 10.0) is None
+
+
+def test_the_balance_begins_with_torque_mode():
+    def torque_of(time_s):
+        return 2.0 * HOLDING_NM if time_s < 0.05 else HOLDING_NM
+
+    def command_of(time_s):
+        return Command(Mode.SPEED if time_s < 1.0 else Mode.TORQUE, 4.0, torque_of(time_s))
+
+    assert first(FlatSpeed(STRING, STILL_RAD_S, LAG_S), torque_of, lambda _: 4.0, 8.0, command_of) is None
+
+
+def test_in_speed_mode_a_speed_that_is_constant_with_the_torque_at_its_limit_is_not_controlled():
+    noticed_s = found(lambda _: LIMIT_NM, mode=Mode.SPEED)
+    assert noticed_s == pytest.approx(FLAT_LIMIT_S, abs=0.11)
+    assert found(lambda _: 0.8 * LIMIT_NM, mode=Mode.SPEED) is None
+    assert found(lambda _: LIMIT_NM, lambda time_s: 4.0 + 0.1 * math.floor(time_s), mode=Mode.SPEED) is None
+    assert found(lambda _: LIMIT_NM, lambda _: STILL_RAD_S, mode=Mode.SPEED) is None
+
+
+def held(until_s=6.0, speed_rad_s=0.0, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, moved=True):
+    """Return the time at which a held shaft is found, s; the speed is reported from the first point on."""
+    return first(HeldShaft(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
+                 lambda _: Command(mode, setpoint_rad_s, torque_nm), moved=moved)
+
+
+def test_a_shaft_that_moved_and_stands_with_the_torque_at_its_limit_is_held_or_not_measured():
+    assert held() == pytest.approx(HELD_S - EVERY_S, abs=0.11)
+    assert held(until_s=HELD_S - 2.0 * EVERY_S) is None
+
+
+@pytest.mark.parametrize("other", [
+    {"speed_rad_s": 2.0 * STILL_RAD_S}, {"torque_nm": 0.8 * LIMIT_NM}, {"setpoint_rad_s": 3.0 * STILL_RAD_S},
+    {"mode": Mode.TORQUE}, {"moved": False},
+])
+def test_a_shaft_is_not_held_without_each_of_these(other):
+    assert held(**other) is None
+
+
+def test_the_time_of_a_held_shaft_begins_anew():
+    stands = {False: 0.0, True: 1.0}
+    assert first(HeldShaft(STRING, STILL_RAD_S), lambda _: LIMIT_NM, lambda time_s: stands[time_s % 1.0 > 0.85], 8.0,
+                 lambda _: Command(Mode.SPEED, 4.0, 0.0)) is None
+
+
+def strained(until_s=8.0, speed_rad_s=4.0, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, known=False):
+    """Return the time at which a torque at its limit is found, s."""
+    return first(TorqueAtLimit(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
+                 lambda _: Command(mode, setpoint_rad_s, torque_nm), known=known)
+
+
+def test_a_speed_at_its_setpoint_needs_no_torque_at_its_limit():
+    assert strained() == pytest.approx(STRAINED_S - EVERY_S, abs=0.11)
+    assert strained(until_s=STRAINED_S - 2.0 * EVERY_S) is None
+
+
+@pytest.mark.parametrize("other", [
+    {"speed_rad_s": 4.0 + 0.2 * FASTEST_RAD_S}, {"torque_nm": 0.8 * LIMIT_NM}, {"mode": Mode.TORQUE}, {"known": True},
+    {"speed_rad_s": 3.0 * STILL_RAD_S, "setpoint_rad_s": 0.0},
+])
+def test_a_torque_at_its_limit_is_no_contradiction_without_each_of_these(other):
+    assert strained(**other) is None
+
+
+def test_the_time_at_the_limit_begins_anew():
+    assert first(TorqueAtLimit(STRING, STILL_RAD_S), lambda time_s: LIMIT_NM * (time_s % 3.0 < 2.85), lambda _: 4.0,
+                 12.0, lambda _: Command(Mode.SPEED, 4.0, 0.0), known=False) is None
+
+
+def ignored(until_s=8.0, speed_of=lambda _: 0.0, mode_of=lambda _: Mode.SPEED, stopping=True, torque_nm=HOLDING_NM,
+            lag_s=LAG_S, yield_rad_s=1.0):
+    """Return the time at which an ignored yield is found, s; torque and commanded yield oscillate."""
+    return first(IgnoredYield(STILL_RAD_S, lag_s, EVERY_S), lambda time_s: torque_nm * math.cos(time_s), speed_of,
+                 until_s, lambda time_s: Command(mode_of(time_s), yield_rad_s * (1.5 + math.cos(time_s)), 0.0),
+                 stopping=stopping)
+
+
+def test_a_shaft_that_stands_while_the_stop_yields_is_not_measured():
+    assert ignored() == pytest.approx(YIELD_S - 2.0 * EVERY_S, abs=0.11)
+
+
+@pytest.mark.parametrize("other", [
+    {"stopping": False}, {"mode_of": lambda _: Mode.TORQUE}, {"speed_of": math.cos}, {"speed_of": lambda _: 1.5},
+    {"torque_nm": 0.5 * BREAKAWAY_NM}, {"yield_rad_s": 0.5 * STILL_RAD_S}, {"lag_s": 0.6 * YIELD_S},
+    {"mode_of": lambda time_s: Mode.SPEED if time_s % 3.0 < 2.85 else Mode.TORQUE},        # the time begins anew
+    {"speed_of": lambda time_s: 0.9 if time_s % 3.5 < 1.0 else 0.0},                       # it moves now and then
+])
+def test_a_yield_is_not_ignored_without_each_of_these(other):
+    assert ignored(**other) is None
+
+
+def test_only_the_last_seconds_of_a_yield_count():
+    assert ignored(until_s=16.0, speed_of=lambda time_s: 1.0 if time_s < 6.0 else 0.0) == pytest.approx(
+        6.0 + YIELD_S, abs=0.3)
+
+
+def test_the_rules_of_an_unknown_load_are_for_a_string_only():
+    assert [type(rule) for rule in rules(LIMITS, STILL_RAD_S, LAG_S, EVERY_S)] == [HeldShaft]
+    assert {type(rule) for rule in rules(STRING, STILL_RAD_S, LAG_S, EVERY_S)} == {
+        HeldShaft, TorqueAtLimit, FlatSpeed, IgnoredYield}
