@@ -234,7 +234,12 @@ class PdoFeedback:
             return
         if self.data or not self._due:
             return
-        self._doubtful = self._here == 1 and self._came_as_usual()
+        took_s, quickest_s = self._last_s - self._begun_s, self._quickest_s
+        self._doubtful = (         # a single answer, at the usual time after this cycle's SYNC
+            self._here == 1 and quickest_s is not None
+            and abs(took_s - self._usual_s) <= _USUAL_SHARE * self._period_s
+            and took_s >= _QUICKEST_SHARE * quickest_s
+        )
         # A drive that has never answered was not yet listening.
         if self._doubtful or not self.arrived or (self._spoiled and not self._here):
             self._given_up += self._due
@@ -296,10 +301,3 @@ class PdoFeedback:
         first = self._quickest_s is None
         self._quickest_s = took_s if self._quickest_s is None else min(self._quickest_s, took_s)
         self._usual_s += (1.0 if first else 0.1) * (took_s - self._usual_s)
-
-    def _came_as_usual(self) -> bool:
-        took_s, quickest_s = self._last_s - self._begun_s, self._quickest_s
-        if quickest_s is None:
-            return False
-        near = abs(took_s - self._usual_s) <= _USUAL_SHARE * self._period_s
-        return near and took_s >= _QUICKEST_SHARE * quickest_s

@@ -45,9 +45,23 @@ class CanopenTarget(Cia402Target):
     def enforce(self, attempt: int) -> None:
         """Send the quick stop in RPDOs too, then switch the other master's RPDO off."""
         if attempt > BY_SDO_TRIES + BY_RPDO_TRIES:
-            self._switch_off_rpdos()
+            for index, cob_id, _, _ in self._rpdos():
+                self._objects.write(index, 1, cob_id | DISABLED, 32)
+                self._said.append(
+                    f"the RPDO of the other master was switched off: {name(index, 1)} = {cob_id | DISABLED:08X}h;"
+                    " to enable it again, restart the drive or start a run"
+                )
         elif attempt > BY_SDO_TRIES:
-            self._burst()
+            frames = [       # each RPDO: zeros, with the controlword in its place; offset and length in bits
+                (cob_id & 0x7FF, (self._word << offset).to_bytes(length // 8, "little"))
+                for _, cob_id, offset, length in self._rpdos()
+            ]
+            if not frames:
+                raise DriveFault("no RPDO carries the controlword", where=name(0x1600))
+            for _ in range(BURST):
+                for identifier, data in frames:
+                    self._link.send(identifier, data)
+                self._link.pump_until(lambda: False, BURST_PAUSE_S)
 
     def wait(self, time_s: float) -> None:
         """Handle frames for this wall time, s."""
@@ -68,26 +82,6 @@ class CanopenTarget(Cia402Target):
     def close(self) -> None:
         """Close the bus."""
         self._link.close()
-
-    def _burst(self) -> None:
-        frames = [       # each RPDO: zeros, with the controlword in its place; offset and length in bits
-            (cob_id & 0x7FF, (self._word << offset).to_bytes(length // 8, "little"))
-            for _, cob_id, offset, length in self._rpdos()
-        ]
-        if not frames:
-            raise DriveFault("no RPDO carries the controlword", where=name(0x1600))
-        for _ in range(BURST):
-            for identifier, data in frames:
-                self._link.send(identifier, data)
-            self._link.pump_until(lambda: False, BURST_PAUSE_S)
-
-    def _switch_off_rpdos(self) -> None:
-        for index, cob_id, _, _ in self._rpdos():
-            self._objects.write(index, 1, cob_id | DISABLED, 32)
-            self._said.append(
-                f"the RPDO of the other master was switched off: {name(index, 1)} = {cob_id | DISABLED:08X}h;"
-                " to enable it again, restart the drive or start a run"
-            )
 
     def _rpdos(self) -> list[tuple[int, int, int, int]]:
         """Return (1400h…, COB-ID, bit offset of 6040h, length in bits) of every enabled RPDO that carries 6040h."""

@@ -423,7 +423,12 @@ class Cia402Drive:
         # Frames that came since the last cycle are checked before this cycle's setpoint is sent.
         now_s = bus.begin(not enabled and not ready.armed)
         if self._standing.by_object or not power.fed:
-            return self._exchange_without_setpoints(now_s)
+            # The cyclic setpoints are disabled, or the drive is left to its own watchdog. In the second case nothing is
+            # sent. In stepped time the cycle is still started, because it advances time.
+            fed = power.fed
+            if fed:
+                self._standing.push(reported.state, power.wish)
+            return self._judge(now_s, bus.receive(now_s, fed or self.clock.stepped))
         mode = self._mode
         mode.cycles += 1
         again = code != reported.shown_code and mode.cycles >= _REPEAT_MODE_CYCLES
@@ -446,16 +451,6 @@ class Cia402Drive:
         elif (sample.fresh or bus.others_drive) and self._standing.undone(now_s, reported.state, bus.others_drive):
             self._stand()
         return sample
-
-    def _exchange_without_setpoints(self, now_s: float) -> Sample:
-        """Run one cycle for a drive whose cyclic setpoints are disabled, or that is left to its own watchdog.
-
-        In the second case nothing is sent. In stepped time the cycle is still started, because it advances time.
-        """
-        fed = self._power.fed
-        if fed:
-            self._standing.push(self._reported.state, self._power.wish)
-        return self._judge(now_s, self._bus.receive(now_s, fed or self.clock.stepped))
 
     def _stand(self) -> None:
         """Write quick stop as an object and disable all cyclic setpoints, because another master reversed the quick
@@ -590,7 +585,12 @@ class Cia402Drive:
         if not stopped:
             self._push()
         bus.feed()
-        position_rad = self._poll_angle()
+        # The angle comes after everything that a stop needs more urgently.
+        position_rad, angle, unwrapped = None, self._prepared.angle, self._prepared.unwrapped
+        if angle is not None and unwrapped is not None:
+            turned = angle.read(bus.objects, self.clock, watchdog_s)
+            bus.feed()
+            position_rad = None if turned is None else unwrapped.take(turned.time_s, turned.position_rad)
         bus.ticks.put_off()
         return self._sample(begun_s + half_s, half_s, True, position_rad)._replace(half_width_s=half_s)
 
@@ -598,15 +598,6 @@ class Cia402Drive:
         """Write the controlword towards the request as an object. Return False if the reported state needs none."""
         ready, power = self._prepared, self._power
         return push(self._bus.objects, self._reported.state, power.wish, ready.watchdog_s, ready.content.offset)
-
-    def _poll_angle(self) -> float | None:
-        """Read the angle as an object, after everything that a stop needs more urgently."""
-        angle, unwrapped = self._prepared.angle, self._prepared.unwrapped
-        if angle is None or unwrapped is None:
-            return None
-        found = angle.read(self._bus.objects, self.clock, self._prepared.watchdog_s)
-        self._bus.feed()
-        return None if found is None else unwrapped.take(found.time_s, found.position_rad)
 
     def read_position(self) -> PositionReading | None:
         """Read the motor's angle as an object between two cycles; None if the drive has none or did not answer in

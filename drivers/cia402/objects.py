@@ -89,14 +89,15 @@ class Objects(ABC):
         where = name(index, subindex)
         if (index, subindex) not in self._changed:
             self._changed.add((index, subindex))
-            self.on_restore(lambda: self._give_back(index, subindex, before))
+
+            def give_back() -> None:
+                self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
+                if self.journal is not None:
+                    self.journal.given_back(where)
+
+            self.on_restore(give_back)
         if self.journal is not None:
             self.journal.changing(where, before, after)
-
-    def _give_back(self, index: int, subindex: int, before: bytes) -> None:
-        self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
-        if self.journal is not None:
-            self.journal.given_back(name(index, subindex))
 
     def on_restore(self, undo: Callable[[], None]) -> None:
         """Register ``undo``, which `restore` calls."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 from drivers.cia402.description import text_if_there
@@ -84,8 +85,13 @@ def find_units(
     table: PreflightTable, objects: Objects, profile: Cia402Profile, rated_torque_nm: float | None
 ) -> tuple[Units, float]:
     """Return the scaling of speed and torque, and the rated torque, N·m."""
-    where = name(profile.torque.rated.index, profile.torque.rated.sub)
-    agreed_nm = agreed_rated_torque(table, _reported_rated_torque(objects, profile), rated_torque_nm, where)
+    rated, per_lsb = profile.torque.rated, profile.torque.rated_torque_nm_per_lsb
+    where, reported_nm = name(rated.index, rated.sub), None
+    if per_lsb is not None:
+        with suppress(ObjectRefused):
+            raw = decode_value(rated.type, objects.rely_on("the rated torque", rated.index, rated.sub), where)
+            reported_nm = raw * per_lsb if raw > 0.0 else None      # a rated torque of 0 is none
+    agreed_nm = agreed_rated_torque(table, reported_nm, rated_torque_nm, where)
     rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused; the following rows still need a scale
     speed = speed_unit(table, objects, profile)
     target = profile.torque.rated_per_lsb * rated_nm
@@ -93,19 +99,6 @@ def find_units(
     if actual is None:
         return Units(speed, target), rated_nm
     return Units(speed, actual.per_lsb * (rated_nm if actual.unit == "rated" else 1.0), target), rated_nm
-
-
-def _reported_rated_torque(objects: Objects, profile: Cia402Profile) -> float | None:
-    """Return the rated torque that the drive reports, N·m; None if it reports none or 0."""
-    place, per_lsb = profile.torque.rated, profile.torque.rated_torque_nm_per_lsb
-    if per_lsb is None:
-        return None
-    try:
-        data = objects.rely_on("the rated torque", place.index, place.sub)
-        raw = decode_value(place.type, data, name(place.index, place.sub))
-    except ObjectRefused:
-        return None
-    return raw * per_lsb if raw > 0.0 else None
 
 
 def speed_unit(table: PreflightTable, objects: Objects, profile: Cia402Profile) -> float:
@@ -422,7 +415,7 @@ def read_identity(objects: Objects) -> Identity:
     vendor, product, revision, serial = (objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
     title = text_if_there(objects, 0x1008)
     return Identity(vendor, product, revision, serial, "CiA 402 drive" if title is None else title,
-                    _is_simulated(objects), text_if_there(objects, 0x100A) or "")
+                    text_if_there(objects, MARKER_INDEX, 1) == MARKER_TEXT, text_if_there(objects, 0x100A) or "")
 
 
 def refuse_stepped(identity: Identity) -> None:
@@ -434,7 +427,3 @@ def refuse_stepped(identity: Identity) -> None:
             next_step="Remove --stepped: a real shaft moves in real time",
             entry=MessageCode.NOT_THE_SIMULATOR,
         )
-
-
-def _is_simulated(objects: Objects) -> bool:
-    return text_if_there(objects, MARKER_INDEX, 1) == MARKER_TEXT

@@ -230,7 +230,10 @@ class Cia402Target:
         profile = self._profile
         if profile.quick_stop.decelerates_in_torque_mode or self._stays_in_torque_mode:
             return
-        speed_modes = [code for code in profile.modes.speed if self._supports(code)]
+        speed_modes = [
+            code for code in profile.modes.speed
+            if (supported := self._objects.read_if_there(0x6502)) is None or code < 1 or supported >> code - 1 & 1
+        ]
         if self._shown() not in profile.modes.torque or not speed_modes:
             return
         if decode(self._objects.read(0x6041)) is not State.OPERATION_ENABLED:
@@ -250,7 +253,3 @@ class Cia402Target:
 
     def _shown(self) -> int:
         return self._objects.read(0x6061, signed=True)
-
-    def _supports(self, code: int) -> bool:
-        supported = self._objects.read_if_there(0x6502)
-        return supported is None or code < 1 or bool(supported >> code - 1 & 1)

@@ -133,7 +133,17 @@ class DriveWatch:
             ))
         if self._troubles:
             kind, trouble = self._troubles.pop(0)
-            raise self._of_host(kind, trouble) if kind in OF_A_SILENT_HOST else trouble
+            if kind in OF_A_SILENT_HOST:
+                # A delay of this host is stated first: it may be the only cause. The drive's watchdog also trips on
+                # many cycles that are each only a little late.
+                away = self.host_late() if kind in OF_A_LATE_HOST else self.host_stood_still()
+                if away:
+                    raise CommunicationLost(
+                        f"{away}. After that: {trouble.what}",
+                        where=trouble.where if kind == HOST_SILENT else f"host; {trouble.where}",
+                        next_step=LOWER_THE_RATE, entry=MessageCode.HOST_LATE,
+                    )
+            raise trouble
 
     def interference(self, what: str, where: str, next_step: str, *, kind: str) -> None:
         """Record that another master changes or drives this drive; `check` raises it once for each ``kind``."""
@@ -211,18 +221,6 @@ class DriveWatch:
         if kind not in self._raised:
             self._raised.add(kind)
             self._troubles.append((kind, trouble))
-
-    def _of_host(self, kind: str, trouble: TdhilError) -> TdhilError:
-        """Return the error with the delay of this host in front, if there was one: the delay may be its only cause.
-
-        The drive's watchdog also trips on many cycles that are each only a little late.
-        """
-        away = self.host_late() if kind in OF_A_LATE_HOST else self.host_stood_still()
-        if not away:
-            return trouble
-        where = trouble.where if kind == HOST_SILENT else f"host; {trouble.where}"
-        return CommunicationLost(f"{away}. After that: {trouble.what}", where=where, next_step=LOWER_THE_RATE,
-                                 entry=MessageCode.HOST_LATE)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

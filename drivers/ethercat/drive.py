@@ -184,8 +184,12 @@ class EthercatBus(cia402.Cia402Bus):
 
         Without ``sync``, or if the watchdog is no longer fed, the feedback is read from the slave's memory.
         """
+        data: bytes | None = None
         if not (sync and self._fed):
-            data = self._from_memory()
+            with suppress(CommunicationLost):
+                start, length, _ = self._station.sync_manager(FEEDBACK)
+                if self._inputs is not None and length == self._inputs.size:
+                    data = self._station.read(start, length)
         else:
             if not self._sent:
                 self._transmit()
@@ -220,14 +224,6 @@ class EthercatBus(cia402.Cia402Bus):
         data: bytes = self._segment.slave.input
         self._seen(False, FEEDBACK, data)
         return data
-
-    def _from_memory(self) -> bytes | None:
-        """Return the inputs without a frame that carries setpoints; None without an answer."""
-        with suppress(CommunicationLost):
-            start, length, _ = self._station.sync_manager(FEEDBACK)
-            if self._inputs is not None and length == self._inputs.size:
-                return self._station.read(start, length)
-        return None
 
     def _look(self, now_s: float, fault: bool) -> None:
         """Check AL state, mailbox (at once if a fault shows) and watchdog. A lost datagram shows in the counter too."""
