@@ -338,7 +338,10 @@ class ModbusDrive:
         self._unless_frozen(self._ticks.wait)
         if setpoints.speed:
             self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction of the shaft that brakes
-        if not self._may_write():
+        # After feeding has ended nothing is written, except to disable a shaft at a safe standstill.
+        if self._silent_since_s is not None and not (
+            self._wish is PowerRequest.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
+        ):
             return self._watch()
         self._poll_other_masters()
         if self._wish is PowerRequest.ENABLED:
@@ -435,12 +438,6 @@ class ModbusDrive:
             with suppress(CommunicationLost, RegisterRefused, CommandRejected):
                 self._access.press(register, counts if before >= 0 else -counts, before, self._timeout_s)
 
-    def _may_write(self) -> bool:
-        """True if this cycle may write: not after feeding has ended, except to disable a shaft at a safe standstill."""
-        if self._silent_since_s is None:
-            return True
-        return self._wish is PowerRequest.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
-
     def _watch(self) -> Sample:
         """Run a cycle that only reads, or not even that while reading feeds the watchdog."""
         begun_s = self.clock.now_s()
@@ -465,8 +462,12 @@ class ModbusDrive:
         While the drive shows itself enabled, the quick-stop word is written alone, once each time. The angle comes
         last.
         """
-        if not self._reads or self._must_be_silent():
+        if not self._reads:
             return None
+        entry, since_s = self._profile.watchdog, self._silent_since_s
+        by_reading = entry.fed_by_any_client or entry.fed_by == "requests_of_this_connection"
+        if since_s is not None and by_reading and self.clock.now_s() - since_s < SILENT_TIMES * self._watchdog_s:
+            return None                # a read would feed a watchdog that must trip
         try:
             until_s = self.clock.now_s() + self.period_s
             got = go_round(self._access, self._reads, {}, self._timeout_s, self._moving, until_s)
@@ -485,13 +486,6 @@ class ModbusDrive:
         self._ticks.done()
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
-
-    def _must_be_silent(self) -> bool:
-        """True if a read would feed a watchdog that must trip."""
-        entry = self._profile.watchdog
-        by_reading = entry.fed_by_any_client or entry.fed_by == "requests_of_this_connection"
-        since_s = self._silent_since_s
-        return since_s is not None and by_reading and self.clock.now_s() - since_s < SILENT_TIMES * self._watchdog_s
 
     def read_position(self) -> PositionReading | None:
         """Read the motor's angle in one transaction between two cycles; None if there is none, or no valid reply."""

@@ -78,7 +78,13 @@ class OtherMaster:
         self._believed = {f"{name} setpoint" for name in read_back}
         self._keep = math.ceil(REMEMBERED_S / period_s) + 2
         self._tight = round_s * (1.0 + 1.0 / max(1, transactions)) > ROOM * period_s
-        watched = [one for one in self._profile.parameters if one.register_ is not None and self._matters(one)]
+        watchdog, cycle = self._profile.watchdog, self._profile.cycle
+        signals = (cycle.speed_setpoint, cycle.torque_setpoint, cycle.speed, cycle.torque)
+        scaling = {signal.times for signal in signals if signal is not None} | {self._profile.rated_torque}
+        # Parameters on which the safety or the result of the run depends.
+        own = {watchdog.parameter, watchdog.reaction_parameter} | scaling
+        watched = [one for one in self._profile.parameters if one.register_ is not None and (
+            one.set_to is not None or one.require is not None or one.name in own)]
         self._settings = []
         open_ones = self._readable_spans([one.register_ for one in watched if one.register_ is not None])
         while open_ones:
@@ -168,14 +174,6 @@ class OtherMaster:
                     next_step=f"{_TAKE_OFF}; check this setting before the next run",
                     entry=MessageCode.FOREIGN_MASTER,
                 )
-
-    def _matters(self, parameter: Parameter) -> bool:
-        """Return whether the safety or the result of the run depends on the parameter."""
-        watchdog, cycle = self._profile.watchdog, self._profile.cycle
-        signals = (cycle.speed_setpoint, cycle.torque_setpoint, cycle.speed, cycle.torque)
-        scaling = {signal.times for signal in signals if signal is not None} | {self._profile.rated_torque}
-        own = {watchdog.parameter, watchdog.reaction_parameter} | scaling
-        return parameter.set_to is not None or parameter.require is not None or parameter.name in own
 
     def _readable_spans(self, registers: list[Register]) -> list[RegisterSpan]:
         tables = {"holding": pdu.READ_HOLDING, "input": pdu.READ_INPUT}

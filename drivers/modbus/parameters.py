@@ -62,8 +62,9 @@ def read_parameters(
                 parameter.title, "known", "can't be read over the bus", False, parameter.name,
                 f"Give drive_data.parameters.{parameter.name} in rig.yaml, as the drive's panel shows it",
             )
-        elif parameter.name in given and parameter.name in counts and not _close(
-            values.get(parameter.name, math.nan), given[parameter.name], _lsb(parameter, values)
+        elif parameter.name in given and parameter.name in counts and not (
+            abs(values.get(parameter.name, math.nan) - given[parameter.name])
+            <= max(0.5 * _lsb(parameter, values), 1e-6 * abs(given[parameter.name]))
         ):
             table.row(
                 parameter.title, show(given[parameter.name], parameter), show(values[parameter.name], parameter), False,
@@ -230,10 +231,6 @@ def fits(parameter: Parameter, counts: int) -> bool:
 
 def _lsb(parameter: Parameter, values: Mapping[str, float]) -> float:
     return per_count(parameter, values) or parameter.per_lsb
-
-
-def _close(one: float, other: float, lsb: float) -> bool:
-    return abs(one - other) <= max(0.5 * lsb, 1e-6 * abs(other))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -66,7 +66,15 @@ class ModbusTarget:
         try:
             if self._stop_would_brake():
                 return True
-            self._ask_for_speed_mode(state)
+            cycle, modes = self._profile.cycle, self._profile.modes
+            if self._switching_since_s is None:
+                self._switching_since_s = self._access.clock.now_s()
+            # Setpoints of zero, then the mode, in its register or by bits of an enabling control word.
+            self._access.write(cycle.speed_setpoint.register_, 0)
+            if modes.register_ is not None and modes.speed_value is not None:
+                self._access.write(modes.register_, modes.speed_value)
+            if state.onward is not None:
+                self._access.write(cycle.control.register_, state.onward | self._speed_bits())
             return self._stop_would_brake()
         except RegisterRefused:
             now_s, since_s = self._access.clock.now_s(), self._switching_since_s
@@ -90,17 +98,6 @@ class ModbusTarget:
         shown = shown_mode(self._profile, self._access.read(modes.display.register_) & 0xFFFF)
         self._stayed_in_torque = shown is not Mode.SPEED and waited_s > MODE_S
         return shown is Mode.SPEED or self._stayed_in_torque
-
-    def _ask_for_speed_mode(self, state: StatusState) -> None:
-        """Write setpoints of zero, then the mode, in its register or by bits of an enabling control word."""
-        cycle, modes = self._profile.cycle, self._profile.modes
-        if self._switching_since_s is None:
-            self._switching_since_s = self._access.clock.now_s()
-        self._access.write(cycle.speed_setpoint.register_, 0)
-        if modes.register_ is not None and modes.speed_value is not None:
-            self._access.write(modes.register_, modes.speed_value)
-        if state.onward is not None:
-            self._access.write(cycle.control.register_, state.onward | self._speed_bits())
 
     def _speed_bits(self) -> int:
         """Return the speed bits of the control word, with its direction bit if it has one."""

@@ -161,7 +161,8 @@ class RtuLink:
         while True:
             wanted = self._length(frame)
             if wanted is not None and len(frame) >= wanted:
-                if not self._sound(frame[:wanted]):
+                whole = frame[:wanted]
+                if not self._framer.check_CRC(whole[:-2], int.from_bytes(whole[-2:], "big")):
                     bad = self._bad(f"a reply with a wrong CRC: {_shown(frame)}")
                     raise NoisyReply(bad.what, where=bad.where, next_step=bad.next_step)
                 reply = frame[1 : wanted - 2]
@@ -218,9 +219,6 @@ class RtuLink:
     def _length(self, frame: bytes) -> int | None:
         length = reply_length(frame[1:])
         return None if length is None else length + UNIT_AND_CRC
-
-    def _sound(self, frame: bytes) -> bool:
-        return self._framer.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big"))
 
     # -- the device ------------------------------------------------------------------------------------------
 

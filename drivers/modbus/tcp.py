@@ -133,10 +133,11 @@ class TcpLink:
             self._given_up.remove(transaction)
             self.late += 1
             return False
-        if transaction != self._transaction and (transaction in self._answered or not self._may_renew()):
-            self.late += 1             # duplicated, or foreign once too often: dropped
-            return False
         if transaction != self._transaction:
+            since_s = self.clock.now_s() - RENEWED_WITHIN_S
+            if transaction in self._answered or sum(at_s >= since_s for at_s in self._renewed_s) >= MOST_RENEWED:
+                self.late += 1         # duplicated, or foreign once too often: dropped, the connection is not renewed
+                return False
             raise self._untrusted(f"a reply with transaction id {transaction}, not {self._transaction}")
         if sender != unit:
             raise self._bad(f"a reply of unit {sender}, not {unit}")
@@ -172,11 +173,6 @@ class TcpLink:
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, DEAD_AFTER_MS)
         return connection
-
-    def _may_renew(self) -> bool:
-        """Return whether the connection may be renewed: not too often within `RENEWED_WITHIN_S`."""
-        since_s = self.clock.now_s() - RENEWED_WITHIN_S
-        return sum(at_s >= since_s for at_s in self._renewed_s) < MOST_RENEWED
 
     def _reconnect(self, timeout_s: float) -> None:
         """Reconnect after a frame that can't be ours, because later data on this connection can't be trusted either.
