@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from struct import Struct
@@ -100,7 +101,19 @@ def texts_of_message(channel: int, payload: bytes) -> Iterator[str]:
         return
     name = CHANNELS[channel][1]
     for text in _texts(CLASSES[name].FromString(payload)):
-        yield from _of_json(text) if name == "Text" else (text,)
+        waiting: list[Any] = [text]
+        if name == "Text":
+            with suppress(ValueError):
+                waiting = [json.loads(text)]
+        while waiting:
+            one = waiting.pop()
+            if isinstance(one, str):
+                yield one
+            elif isinstance(one, dict):
+                yield from one
+                waiting += one.values()
+            elif isinstance(one, list):
+                waiting += one
 
 
 def _texts(message: Any) -> Iterator[str]:
@@ -110,20 +123,3 @@ def _texts(message: Any) -> Iterator[str]:
                 yield from _texts(one)
             elif field.type == field.TYPE_STRING:
                 yield one
-
-
-def _of_json(text: str) -> Iterator[str]:
-    try:
-        waiting = [json.loads(text)]
-    except ValueError:
-        yield text
-        return
-    while waiting:
-        one = waiting.pop()
-        if isinstance(one, str):
-            yield one
-        elif isinstance(one, dict):
-            yield from one
-            waiting += one.values()
-        elif isinstance(one, list):
-            waiting += one

@@ -178,7 +178,10 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
                     return
             yield found
         elif opcode == HEADER and end <= size and length < 4096:
-            yield Library(_library(read_at(file, offset + _RECORD.size, length)))
+            body = read_at(file, offset + _RECORD.size, length)     # n:4 profile  n:4 library
+            start = 4 + int.from_bytes(body[:4], "little")
+            name = body[start + 4:start + 4 + int.from_bytes(body[start:start + 4], "little")]
+            yield Library(name.decode("utf-8", "replace"))
         elif end <= size and _is_added(file, opcode, offset + _RECORD.size, end):
             offset = end
             continue
@@ -219,10 +222,3 @@ def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
                 return offset + match.start() - before
         offset += _STEP
     return None
-
-
-def _library(body: bytes) -> str:
-    """Return the library from a header record, ``n:4 profile  n:4 library``."""
-    start = 4 + int.from_bytes(body[:4], "little")
-    length = int.from_bytes(body[start:start + 4], "little")
-    return body[start + 4:start + 4 + length].decode("utf-8", "replace")

@@ -169,7 +169,18 @@ def result_document(
         "friction_curve": [asdict(point) for point in found.friction_curve],
         "harmonics": None if found.harmonics is None else [asdict(one) for one in found.harmonics],
         "backlash": None if found.backlash is None else [asdict(one) for one in found.backlash],
-        "compliant": _compliant(found),
+        "compliant": None if (shaft := found.compliant) is None else {
+            "motor_inertia_kg_m2": None if found.inertia is None else {     # the result's own inertia, J_r
+                name: getattr(found.inertia, name) for name in ("value", "low_total", "high_total", "low", "high")
+            },
+            "load_inertia_kg_m2": _estimate(shaft.load_inertia),
+            "total_inertia_kg_m2": _estimate(shaft.total_inertia),
+            "stiffness_nm_rad": _estimate(shaft.stiffness_nm_rad),
+            "damping_nm_s_rad": _estimate(shaft.damping_nm_s_rad),
+            "resonance_hz": _estimate(shaft.resonance_hz),
+            "antiresonance_hz": _estimate(shaft.antiresonance_hz),
+            "covariance": None if shaft.covariance is None else asdict(shaft.covariance),
+        },
         "impedance": None if found.impedance is None else asdict(found.impedance) | {
             "verdict": found.impedance.verdict.value
         },
@@ -308,26 +319,6 @@ def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:
     repeatability = 0.5 * (inertia.high - inertia.low) / inertia.value
     first = {name: found.pop(name) for name in ("value", "low_total", "high_total")}
     return first | {"half_width_total_rel": total} | found | {"repeatability_rel": repeatability}
-
-
-def _compliant(found: Identification) -> dict[str, Any] | None:
-    """Return the shaft behind the spring; ``motor_inertia_kg_m2`` is the result's own inertia, J_r."""
-    shaft = found.compliant
-    if shaft is None:
-        return None
-    motor = found.inertia
-    return {
-        "motor_inertia_kg_m2": None if motor is None else {
-            n: getattr(motor, n) for n in ("value", "low_total", "high_total", "low", "high")
-        },
-        "load_inertia_kg_m2": _estimate(shaft.load_inertia),
-        "total_inertia_kg_m2": _estimate(shaft.total_inertia),
-        "stiffness_nm_rad": _estimate(shaft.stiffness_nm_rad),
-        "damping_nm_s_rad": _estimate(shaft.damping_nm_s_rad),
-        "resonance_hz": _estimate(shaft.resonance_hz),
-        "antiresonance_hz": _estimate(shaft.antiresonance_hz),
-        "covariance": None if shaft.covariance is None else asdict(shaft.covariance),
-    }
 
 
 def _scaled(estimate: Estimate | None, found: Identification, recording: Recording) -> dict[str, float] | None:

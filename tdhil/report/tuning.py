@@ -113,6 +113,15 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     taken = [one for one in tuning.tuned if one.controller is not None]
     search = tuning.searched
     lag_s = case.drive.total_lag_s
+    # For |r| > 1 the loop is stable only by the losses of the string, which are not measured.
+    warnings, wide_hz = [*tuned_for.warnings], np.geomspace(0.02, 5.0, 300)
+    for one in tuning.tuned:
+        if one.controller is not None:
+            over = reflection_at(case.drive, one.controller, string, wide_hz)
+            if over.max() > 1.001:
+                warnings.append(
+                    f"{one.kind} sends back up to {over.max():.3f} of a wave at {wide_hz[int(over.argmax())]:.2g} Hz. "
+                    "There only the drag of mud and bit, as stated in string.yaml, keeps it stable.")
     lags_moved = [[end.drive.total_lag_s for end in pair] for pair in case.moves(present=False)]
     return {
         "tuned_for": {
@@ -158,24 +167,9 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
         },
         "required_margins": asdict(case.required),
         "advice": _advice(tuning),
-        "warnings": [*tuned_for.warnings, *_sends_back_more(tuning)],
+        "warnings": warnings,
         "tdhil": __version__,
     }
-
-
-def _sends_back_more(tuning: Tuning) -> Iterator[str]:
-    """Yield a warning for |r| > 1: there the loop is stable only by the losses of the string, which are not
-    measured.
-    """
-    import numpy as np
-
-    hertz = np.geomspace(0.02, 5.0, 300)
-    for one in tuning.tuned:
-        if one.controller is not None:
-            over = reflection_at(tuning.case.drive, one.controller, tuning.case.string, hertz)
-            if over.max() > 1.001:
-                yield (f"{one.kind} sends back up to {over.max():.3f} of a wave at {hertz[int(over.argmax())]:.2g} Hz. "
-                       "There only the drag of mud and bit, as stated in string.yaml, keeps it stable.")
 
 
 def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> dict[str, Any]:

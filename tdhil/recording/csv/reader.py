@@ -267,7 +267,15 @@ def _read_columns(
     dropped = _left_out(reader, layout, choices, file)
     for column, factor in zip(columns, factors, strict=True):
         np.multiply(column, factor, out=column)
-    columns, lines = _possible(columns, lines, choices, dropped, file)
+    good = np.ones(len(lines), dtype=np.bool_)
+    for column in columns:
+        good &= np.abs(column) < LARGEST
+    if not np.any(good):
+        raise CsvUnusable(f"no row has {named(choices)}", where=file, next_step="Look at it in an editor")
+    lost = np.flatnonzero(~good)
+    if len(lost):
+        dropped.append(f"{file}:{lines[lost[0]]}: {_row_list(len(lost))} dropped: a number beyond every machine")
+        columns, lines = [column[good] for column in columns], lines[good]
     if layout.clock:
         columns[0] -= columns[0][0]
     if whole:
@@ -343,22 +351,6 @@ def _left_out(reader: RowReader, layout: ColumnLayout, choices: Choices, file: s
         f"{file}:{tally.first}: {_row_list(tally.count)} dropped: {cause}"
         for tally, cause in causes if tally.count
     ]
-
-
-def _possible(
-    columns: list[FloatArray], lines: LineArray, choices: Choices, dropped: list[str], file: str
-) -> tuple[list[FloatArray], LineArray]:
-    """Return the rows without impossible values. Raises CsvUnusable if none is left."""
-    good = np.ones(len(lines), dtype=np.bool_)
-    for column in columns:
-        good &= np.abs(column) < LARGEST
-    if not np.any(good):
-        raise CsvUnusable(f"no row has {named(choices)}", where=file, next_step="Look at it in an editor")
-    lost = np.flatnonzero(~good)
-    if len(lost):
-        dropped.append(f"{file}:{lines[lost[0]]}: {_row_list(len(lost))} dropped: a number beyond every machine")
-        columns, lines = [column[good] for column in columns], lines[good]
-    return columns, lines
 
 
 def _rows(tally: Tally) -> str:

@@ -116,10 +116,12 @@ def _header(lines: Sequence[str], file: str) -> tuple[Header, int]:
             words = sum(bool(name) and not _is_value(name) for name in names)
             if words < 2 or len(names) > MOST_COLUMNS or (best is not None and words <= best[0]):
                 continue
-            first = next((at for at in range(number_, min(number_ + _BELOW, len(lines)))
-                          if _is_row(lines[at], delimiter, len(names))), None)
-            if first is not None:
-                best = words, Header(number_, delimiter, tuple(names), ()), first
+            for first in range(number_, min(number_ + _BELOW, len(lines))):
+                cells = split_cells(lines[first], delimiter)
+                if (len(names) <= len(cells) <= len(names) + 1 and sum(map(_is_value, cells)) >= 2
+                        and (_is_value(cells[0]) or is_missing(cells[0]))):
+                    best = words, Header(number_, delimiter, tuple(names), ()), first
+                    break
     if best is not None:
         return best[1], best[2]
     header = find_header(lines, USUAL, file)       # its error states what is missing
@@ -129,13 +131,6 @@ def _header(lines: Sequence[str], file: str) -> tuple[Header, int]:
 
 def _is_value(cell: str) -> bool:
     return looks_numeric(cell) or (":" in cell and cell[:1].isdigit())
-
-
-def _is_row(line: str, delimiter: str, width: int) -> bool:
-    cells = split_cells(line, delimiter)
-    values = sum(map(_is_value, cells))
-    return width <= len(cells) <= width + 1 and values >= 2 and all(
-        _is_value(cell) or is_missing(cell) for cell in cells[:1])
 
 
 def guess_columns(
