@@ -347,7 +347,18 @@ class ReadBack:
             if now_s - self._asked_s < READ_BACK_ANSWER_S:
                 return
             self._asked = None
-            self._unanswered()
+            self._silent += 1
+            if not self._answered and self._silent >= GIVE_UP:
+                self._over = True
+                self._watch.remark(
+                    "the drive answers no SDO requests in motion: watchdog and limits were not read back")
+            elif self._answered and self._silent >= LOST:
+                self._over = True
+                self._watch.interference(
+                    f"the drive did not answer {LOST} SDO requests in a row: watchdog and limits can't be read back",
+                    f"{self._place}, SDO",
+                    "Check a gateway in between and the load of the drive; see the frames in the log", kind="read back",
+                )
         if self._due_s is None:
             self._due_s = now_s
         if self._next or now_s >= self._due_s - 1e-9:
@@ -414,19 +425,6 @@ class ReadBack:
                 f"{self._place}, {name(one.index, one.sub)}",
                 "A second master, a panel or another fieldbus may drive it. Disconnect it and start again",
                 kind="setpoint",
-            )
-
-    def _unanswered(self) -> None:
-        self._silent += 1
-        if not self._answered and self._silent >= GIVE_UP:
-            self._over = True
-            self._watch.remark("the drive answers no SDO requests in motion: watchdog and limits were not read back")
-        elif self._answered and self._silent >= LOST:
-            self._over = True
-            self._watch.interference(
-                f"the drive did not answer {LOST} SDO requests in a row: watchdog and limits can't be read back",
-                f"{self._place}, SDO",
-                "Check a gateway in between and the load of the drive; see the frames in the log", kind="read back",
             )
 
     def _drop(self, one: _WatchedObject) -> None:
