@@ -41,6 +41,11 @@ def with_interval(value: float, low: float, high: float, unit: str) -> str:
     return "{} ({} to {}) ".format(*rounded(value, low, high)) + unit
 
 
+def part_with_interval(part: Mapping[str, Any], unit: str) -> str:
+    """Return a quantity of a document as `with_interval`."""
+    return with_interval(part["value"], part["low"], part["high"], unit)
+
+
 def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
     """Return the three values as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
     ends = [number for number in (low, high) if number is not None]
@@ -230,7 +235,7 @@ def estimate_text(part: Mapping[str, Any], unit: str) -> str:
     shown, _, most = rounded(part["value"], part["low"], part["high"])
     if part["low"] == 0.0 and part["high"] > 0.0 and float(shown) == 0.0:
         return f"at most {most} {unit}"
-    return with_interval(part["value"], part["low"], part["high"], unit)
+    return part_with_interval(part, unit)
 
 
 def quoted(part: Mapping[str, Any]) -> Mapping[str, Any]:

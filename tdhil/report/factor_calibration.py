@@ -25,7 +25,7 @@ from tdhil.report.calibration_page import (
     scale_error,
     shown_degrees,
 )
-from tdhil.report.card import with_interval
+from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
@@ -165,12 +165,8 @@ _TITLES = {PAIRS: "torque calibration by pairs", REFERENCE: "torque calibration 
            KNOWN_PIPE: "torque calibration by a known pipe"}
 
 
-def _interval(part: Part, unit: str) -> str:
-    return with_interval(part["value"], part["low"], part["high"], unit)
-
-
 def _pairs_rows(document: Part) -> Iterator[tuple[str, str]]:
-    yield "offset", _interval(document["offset_nm"], "N·m")
+    yield "offset", part_with_interval(document["offset_nm"], "N·m")
     yield "scatter", _scatter(document)
     yield "hysteresis", _hysteresis(document)
     for pair in document["pairs"]:
@@ -192,7 +188,7 @@ def _hysteresis(document: Part) -> str:
 
 def _reference_rows(document: Part) -> Iterator[tuple[str, str]]:
     if document["offset_nm"] is not None:
-        yield "offset", _interval(document["offset_nm"], "N·m")
+        yield "offset", part_with_interval(document["offset_nm"], "N·m")
     yield from _alignment(document)
 
 

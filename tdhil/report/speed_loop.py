@@ -16,7 +16,7 @@ from rich.text import Text as Words
 from profiles import CodedText, MessageCode, entry_of, with_code
 from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
-from tdhil.report.card import with_interval
+from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import SIMULATED, only_finite
 from tdhil.report.graphs import GRAPHS
@@ -263,11 +263,11 @@ def print_loop_tuning(document: Part, console: PlainConsole) -> None:
 def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     plant = document["plant"]
     name = "J" if plant["resonance_hz"] is None else "J, motor side"
-    yield name, _with_ends(plant["inertia_kg_m2"], "kg·m²")
-    yield "viscous friction", _with_ends(plant["viscous_nm_s_rad"], "N·m·s/rad")
+    yield name, part_with_interval(plant["inertia_kg_m2"], "kg·m²")
+    yield "viscous friction", part_with_interval(plant["viscous_nm_s_rad"], "N·m·s/rad")
     if plant["resonance_hz"] is not None:
-        yield "antiresonance", _with_ends(plant["antiresonance_hz"], "Hz")
-        yield "resonance", _with_ends(plant["resonance_hz"], "Hz")
+        yield "antiresonance", part_with_interval(plant["antiresonance_hz"], "Hz")
+        yield "resonance", part_with_interval(plant["resonance_hz"], "Hz")
     dead = plant["dead_time_s"]
     lags = " + ".join(f"{1e3 * lag['value']:.3g}" for lag in plant["lags_s"])
     together = [1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high")]
@@ -285,10 +285,6 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.0f}" if share > 0.1 else f"{100.0 * share:.2g}"
-
-
-def _with_ends(part: Part, unit: str) -> str:
-    return with_interval(part["value"], part["low"], part["high"], unit)
 
 
 def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:

@@ -12,7 +12,7 @@ from rich.text import Text as Words
 
 from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
-from tdhil.report.card import with_interval
+from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import SIMULATED
 from tdhil.report.operator_map import map_section, print_map
@@ -339,8 +339,7 @@ def _string_words(document: Part) -> str:
 
 def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     main, string, tuned_for = document["main_shaft"], document["string"], document["tuned_for"]
-    inertia = main["inertia_kg_m2"]
-    yield "J, main shaft", with_interval(inertia["value"], inertia["low"], inertia["high"], "kg·m²")
+    yield "J, main shaft", part_with_interval(main["inertia_kg_m2"], "kg·m²")
     lags = " + ".join(f"{1e3 * lag:.3g}" for lag in main["inner_lags_s"])
     whole = main["inner_lag_s"]
     yield "lags in the loop", f"{lags} ms, {main['inner_lags_from']}" + (
