@@ -97,7 +97,7 @@ def open_segment(interface: str, position: int = 0, alias: int | None = None) ->
         import pysoem
     except ImportError as error:
         raise PreflightRefused("EtherCAT needs the package pysoem", where="pysoem",
-                               next_step="Install it: pip install 'tdhil[ethercat]'",
+                               next_step="Install it in the clone of tdhil: pip install '.[ethercat]'",
                                entry=MessageCode.PREFLIGHT_REFUSED) from error
     pysoem.settings.timeouts.ret = FRAME_US
     master = pysoem.Master()

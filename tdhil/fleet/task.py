@@ -221,7 +221,7 @@ def remote(url: str) -> tuple[Any, str]:
     except ImportError as error:
         extra = "s3" if url.startswith(("s3://", "s3a://")) else "cluster"
         raise UsageError(f"a library for this address is missing: {error}", where=url,
-                         next_step=f"Install: pip install 'tdhil[{extra}]', and what the message names",
+                         next_step=f"Install it in the clone of tdhil: pip install '.[{extra}]'",
                          entry=MessageCode.PACKAGE_MISSING) from error
     return system, inside
 
