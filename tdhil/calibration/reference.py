@@ -123,7 +123,7 @@ def calibrate_reference(
     for name, one in (("drive's torque", drive), ("reference torque", sensor)):
         swing = _swing(one.torque_nm)
         if swing <= LEAST_SWING_COUNTS * one.count_nm or swing == 0.0:
-            return ReferenceFit(f"the {name} swings too little: by {swing:.3g} N·m"
+            return ReferenceFit(f"the {name} varies too little: by {swing:.3g} N·m"
                                 + (f", and its resolution is {one.count_nm:.3g} N·m" if one.count_nm else ""),
                                 "change the torque in the record by as much as the rig allows")
     shortest = min(float(np.ptp(drive.time_s)), float(np.ptp(sensor.time_s)))
@@ -408,7 +408,7 @@ def _judged(
     """Return the result with budget, interval, and the refusal if there is one."""
     k = fit.slope
     if not math.isfinite(fit.reported):
-        return ReferenceFit("the torque swings too little for its noise: its scale and the low-pass filters look alike",
+        return ReferenceFit("the torque varies too little for its noise: its scale and the low-pass filters look alike",
                             "change the torque by more, or record for longer", correlation=correlation,
                             time_offset_s=fit.delay_s)
     if fit.own_share < LEAST_OWN_SHARE:
@@ -442,7 +442,7 @@ def _judged(
     assumed = normal_quantile(confidence) * scale_rel_sd
     if factor.half_width_share > assumed:
         return replace(
-            found, refusal=f"the torque swings too little: {found.swing_nm:.3g} N·m leave κ at"
+            found, refusal=f"the torque varies too little: {found.swing_nm:.3g} N·m leave κ at"
             f" ±{factor.half_width_share:.1%}, and the stated torque scale leaves ±{assumed:.1%}",
             advice="change the torque by more, in steps and slowly, or record for longer")
     if abs(k - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:

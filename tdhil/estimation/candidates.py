@@ -25,7 +25,7 @@ class FitRoute(StrEnum):
     """
 
     LINES = "periodic excitation: spectral lines"
-    LOAD = "a load that swings, from the same lines"
+    LOAD = "a load that oscillates, from the same lines"
     RECORD = "a record without periodic excitation"
     BAND = "friction in one band of such a record"
 
@@ -51,7 +51,7 @@ class CandidateModel:
 
 
 BEFORE_ECHO, CLEAR_LINES, WEAK_LINES, LOAD_SWINGS, BENT_FRICTION = (
-    "before the echo", "clear lines", "weak lines", "load that swings", "bent friction")
+    "before the echo", "clear lines", "weak lines", "load that oscillates", "bent friction")
 KNOWN_PIPE, REQUESTED, TWO_MASSES, A_STRING, SCALED_PIPE, BY_DIFFERENCE = (
     "known pipe", "requested shaft", "two masses", "string", "scaled pipe", "lines by difference")
 WIDE_BAND, NARROW_BAND = "wide band", "narrow band"
@@ -101,7 +101,7 @@ CANDIDATES: tuple[CandidateModel, ...] = (
     CandidateModel(
         BENT_FRICTION, FitRoute.LINES, model="rigid shaft whose friction is bent over speed (Stribeck, fan)",
         data="the lines of the rigid shaft, and the mean torques", prior="as before",
-        tried="the rigid shaft is rejected; with --model auto also if p is below 0.01 and no load swings",
+        tried="the rigid shaft is rejected; with --model auto also if p is below 0.01 and no load oscillates",
         stands="the residuals allow it, and −2 ln L falls by more than 2 ln n",
         interval="profiles of all shapes of the bend that the data allow",
         reason="friction that is not straight leaks into the lines; the residuals contradict the shaft, but not its J",
@@ -124,8 +124,8 @@ CANDIDATES: tuple[CandidateModel, ...] = (
         TWO_MASSES, FitRoute.LOAD, model="two masses on a spring", data="the same lines", prior="none of the load",
         tried="no compliant shaft is requested", stands="the residuals allow it, and the lines see its swing",
         interval=f"{_FAMILY}; joined with that of the string beside it",
-        reason="the simplest shaft that swings; a third of a light string seems to turn with the motor, so that J holds"
-               " the values of both",
+        reason="the simplest shaft that oscillates; a third of a light string seems to turn with the motor, so that J"
+               " holds the values of both",
         test="tests/estimation/test_two_mass.py::test_auto_finds_two_masses_and_says_so",
     ),
     CandidateModel(

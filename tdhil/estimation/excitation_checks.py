@@ -218,7 +218,7 @@ def undeclared_warning(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, 
         if found:
             hertz, amplitude, declared = max(found, key=lambda line: line[1])
             said.append(CodedText(
-                f"undeclared motion: the {name} swings by {amplitude:.2g} {unit} at {hertz:.4g} Hz, which is no "
+                f"undeclared motion: the {name} oscillates by {amplitude:.2g} {unit} at {hertz:.4g} Hz, which is no "
                 f"excited line (the strongest line has {declared:.2g} {unit}). Look for a limit cycle, a "
                 "resonance, aliased ripple, or lines that were declared wrongly",
                 MessageCode.UNDECLARED_MOTION,

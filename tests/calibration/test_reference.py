@@ -84,8 +84,8 @@ def test_what_cannot_be_calibrated_is_refused_by_name():
         ("opposite sign", replace(sensor, torque_nm=-sensor.torque_nm)),
         ("correlation of both torques is too low", other),
         ("no overlap", shortened(sensor, sensor.time_s < sensor.time_s[0] + 5.0)),
-        ("swings too little", replace(sensor, torque_nm=np.full(len(sensor.time_s), 80.0))),
-        ("swings too little", replace(sensor, torque_nm=np.round(sensor.torque_nm / 50.0) * 50.0, count_nm=50.0)),
+        ("varies too little", replace(sensor, torque_nm=np.full(len(sensor.time_s), 80.0))),
+        ("varies too little", replace(sensor, torque_nm=np.round(sensor.torque_nm / 50.0) * 50.0, count_nm=50.0)),
         ("no error of a torque scale", replace(sensor, torque_nm=2.0 * sensor.torque_nm)),
     ):
         found = calibrate_reference(drive, one)

@@ -38,7 +38,7 @@ class Trouble:
     warming: float = 0.0          # N·m of friction that is lost, by the time constant
     warming_s: float = 80.0
     creep: float = 0.0            # N·m/s
-    hunting: float = 0.0          # N·m of a load that swings at
+    hunting: float = 0.0          # N·m of a load that oscillates at
     hunting_hz: float = 1.7
     torque_limit: float = 400.0   # of the motor
     gust: float = 3.0             # N·m sd of the load

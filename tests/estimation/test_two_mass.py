@@ -206,7 +206,7 @@ def test_intervals_hold_over_seeds():
 
 
 def test_a_resonance_just_above_the_band_is_no_rigid_shaft():
-    """Rejected outright, or doubted and then explained by a load that swings."""
+    """Rejected outright, or doubted and then explained by a load that oscillates."""
     plant = TwoMass(83.0, 21.0, 21.0 * (2.0 * np.pi * 0.55) ** 2, 2.0, 6.0, 2.0)
     for seed in range(3):
         lines, constraint = synthetic(plant, seed, 1.0, (0.05, 0.1, 0.15, 0.25, 0.35, 0.5))

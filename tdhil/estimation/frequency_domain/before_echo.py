@@ -389,8 +389,8 @@ def refuse_stick_slip(case: PeriodicCase) -> None:
         downhole = downhole_swing_rad_s(torque_nm, pipe.impedance_nm_s_rad, pipe.delay_s, period_s)
         if downhole >= STICK_SLIP_SHARE * mean_rad_s:
             raise Refused(
-                f"stick-slip: besides the excitation the speed swings by ±{swing_rad_s:.2f} rad/s every {period_s:.1f}"
-                f" s about {mean_rad_s:.3g} rad/s, as above a bit that sticks and slips",
+                f"stick-slip: besides the excitation the speed oscillates by ±{swing_rad_s:.2f} rad/s every "
+                f"{period_s:.1f} s about {mean_rad_s:.3g} rad/s, as above a bit that sticks and slips",
                 "lift the bit off bottom, take weight off it, or turn faster",
                 entry=MessageCode.STICK_SLIP_RECORDED,
             )

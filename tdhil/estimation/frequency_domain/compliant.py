@@ -507,7 +507,7 @@ def _budget(fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: flo
 
 _LOOK_FOR = "look for play, a bit that sticks, or friction that changes with speed or time"
 _OPEN = Refusal(
-    "the excited lines show a load that swings, but do not determine its inertia",
+    "the excited lines show a load that oscillates, but do not determine its inertia",
     "raise the amplitude, excite for more periods, and excite lines on both sides of the resonance",
 )
 _UNSEEN = Refusal(
@@ -543,7 +543,7 @@ def identify_compliant(
             return Refusal(f"the rig's load is a string: {chosen.reason}", chosen.advice, chosen.entry)
         if contradicted is None:
             return rigid or chosen
-        advice = f"{contradicted.words.if_rejected}. If the load swings: {chosen.advice}"
+        advice = f"{contradicted.words.if_rejected}. If the load oscillates: {chosen.advice}"
         return replace(contradicted, words=replace(contradicted.words, if_rejected=advice))
     if result is None:
         if is_string and not rejects(chosen.fit.residual):
