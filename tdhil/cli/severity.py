@@ -17,10 +17,8 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 
 if TYPE_CHECKING:
     from tdhil.recording import Recording
-    from tdhil.session import RunRecord
     from tdhil.soft_torque import (
         BitNoiseEstimate,
-        DrillString,
         Interval,
         Severity,
         SpeedController,
@@ -60,6 +58,8 @@ def run(namespace: argparse.Namespace) -> int:
         severity_document,
         severity_report,
     )
+    from tdhil.session import require_file
+    from tdhil.soft_torque import SeverityRefused, bit_noise_in, severity
 
     check_trace(namespace)
     paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
@@ -74,12 +74,18 @@ def run(namespace: argparse.Namespace) -> int:
     simulated = False
     configurations = []
     for path in paths:
-        severity, noise, record = _assess(path, namespace, result, string, inertia,
-                                          expected if path == paths[-1] else None, warnings)
-        simulated = record.recording.simulated
-        configurations.append(record.configuration)
-        found.append((severity, str(path)))
-        noises.append(noise)
+        require_file(path)
+        recorded = read_recorded(namespace, path)
+        warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
+        record, remarks = _surface(recorded.recording, result, namespace)
+        warnings += remarks
+        found.append((severity(record, string, inertia, expected if path == paths[-1] else None), str(path)))
+        try:
+            noises.append(bit_noise_in(record, string, inertia))
+        except SeverityRefused as refused:     # a text states why the record does not determine the bit noise
+            noises.append(str(refused))
+        simulated = recorded.recording.simulated
+        configurations.append(recorded.configuration)
     document = severity_document(found, noises, string, inertia, simulated=simulated,
                                  warnings=tuple(dict.fromkeys(warnings)))
     if namespace.json:
@@ -89,30 +95,6 @@ def run(namespace: argparse.Namespace) -> int:
     if report is not None:
         report.write(severity_report(document, [one for one, _ in found]), configurations)
     return int(ExitCode.OK)
-
-
-def _assess(
-    path: Path, namespace: argparse.Namespace, result: Mapping[str, Any], string: DrillString, inertia: Interval,
-    expected: tuple[TopDrive, SpeedController] | None, warnings: list[str],
-) -> tuple[Severity, BitNoiseEstimate | str, RunRecord]:
-    """Return severity and bit noise of one recording, and its record; add warnings.
-
-    A text in place of the bit noise is the reason why the record does not determine it.
-    """
-    from tdhil.session import require_file
-    from tdhil.soft_torque import SeverityRefused, bit_noise_in, severity
-
-    require_file(path)
-    recorded = read_recorded(namespace, path)
-    warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
-    record, remarks = _surface(recorded.recording, result, namespace)
-    warnings += remarks
-    found = severity(record, string, inertia, expected)
-    try:
-        noise: BitNoiseEstimate | str = bit_noise_in(record, string, inertia)
-    except SeverityRefused as refused:
-        noise = str(refused)
-    return found, noise, recorded
 
 
 def _inertia(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[float, Interval]:

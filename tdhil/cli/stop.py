@@ -59,7 +59,15 @@ def run(namespace: argparse.Namespace) -> int:
     except Exception as error:         # no connection, or a lost one; the driver of an adapter may raise any error
         if exit_code(error) is ExitCode.USAGE:
             raise
-        return _not_reached(error, as_json=namespace.json is True)
+        # the connection error alone would not state that the stop did not reach the drive
+        as_json, code = namespace.json is True, ExitCode.STOP_NOT_CONFIRMED
+        if as_json:
+            document = {"ended": "not reached", "error": str(error), "code": code_of(error), "remarks": [],
+                        "said": NOT_CONFIRMED, "emergency_stop": False, "exit_code": int(code)}
+            print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
+        print(f"tdhil: {with_code(str(error), code_of(error))}", file=sys.stderr)  # noqa: T201
+        print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
+        return int(code)
     except KeyboardInterrupt:
         print(NOT_CONFIRMED, file=sys.stderr)  # noqa: T201
         raise
@@ -69,18 +77,6 @@ def run(namespace: argparse.Namespace) -> int:
     else:
         for line in said(report):
             print(line)  # noqa: T201
-    return int(code)
-
-
-def _not_reached(error: Exception, *, as_json: bool) -> int:
-    """Report a stop that did not reach the drive; the connection error alone would not state this."""
-    code = ExitCode.STOP_NOT_CONFIRMED
-    if as_json:
-        document = {"ended": "not reached", "error": str(error), "code": code_of(error), "remarks": [],
-                    "said": NOT_CONFIRMED, "emergency_stop": False, "exit_code": int(code)}
-        print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
-    print(f"tdhil: {with_code(str(error), code_of(error))}", file=sys.stderr)  # noqa: T201
-    print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
     return int(code)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tdhil.recording import Recording, Stage
     from tdhil.runner import Idle, Task
     from tdhil.runner.excitation import Plan, SpeedChangePlan
-    from tdhil.studies import Chapter, FieldRun, RunProgress, Study, StudyOutcome
+    from tdhil.studies import Chapter, FieldRun, RunProgress, Study
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -232,25 +232,21 @@ def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[
         found = [(study, with_assignments(settings, namespace.assignments)) for study, settings in found]
     if namespace.seed is None:
         return found
-    return [(study, _seeded(study, settings, namespace.seed, alone=len(found) == 1)) for study, settings in found]
-
-
-def _seeded(study: Study, settings: Any, seed: int, *, alone: bool) -> Any:
-    from tdhil.errors import UsageError
-    from tdhil.studies import with_assignments
-
-    if "seed" in type(settings).model_fields:
+    seeded: list[tuple[Study, Any]] = []
+    for study, settings in found:
+        random = "seed" in type(settings).model_fields
+        if not random and len(found) == 1:
+            raise UsageError(f"nothing in {study.name} is random", where="--seed",
+                             entry=MessageCode.STUDY_SETTING_WRONG)
         try:
-            return with_assignments(settings, [f"seed={seed}"])
+            seeded.append((study, with_assignments(settings, [f"seed={namespace.seed}"]) if random else settings))
         except UsageError as error:
             raise UsageError(error.what.removeprefix("--set "), where="--seed") from None
-    if alone:
-        raise UsageError(f"nothing in {study.name} is random", where="--seed", entry=MessageCode.STUDY_SETTING_WRONG)
-    return settings
+    return seeded
 
 
 def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, report: bool) -> int:
-    from tdhil.errors import ExitCode, Interrupted, TdhilError, error_document, exit_code
+    from tdhil.errors import ExitCode, Interrupted, TdhilError, UsageError, error_document, exit_code
     from tdhil.report import PlainConsole, stderr_console
     from tdhil.studies import (
         INSTALL,
@@ -264,7 +260,12 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
     )
 
     stderr, out = stderr_console(), PlainConsole()
-    folder = _made(namespace.out)
+    folder: Path = namespace.out
+    try:                               # before the computation
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"can't be made a folder ({error.strerror})", where=f"--out {folder}",
+                         entry=MessageCode.FILE_NOT_WRITABLE) from None
     chapters: list[Chapter] = []
     documents: list[dict[str, Any]] = []
     code, without = 0, False
@@ -290,7 +291,12 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         documents.append(document(outcome, settings, written))
         if not namespace.json:
             print_outcome(outcome, written, out)
-        stderr.print(_cost(outcome, took_s), style="dim", markup=False)
+        cost = f"{outcome.name}: {took_s:.1f} s"
+        if outcome.simulated_s > 0.0:
+            # of the simulation alone if the study reports it
+            each_ms = 1e3 * (outcome.simulation_wall_s or took_s) / outcome.simulated_s
+            cost += f"; {outcome.simulated_s:.0f} simulated seconds, {each_ms:.3g} ms each"
+        stderr.print(cost, style="dim", markup=False)
         if outcome.interrupted:
             stderr.print(f"tdhil: {study.name} was interrupted; its figures use the runs finished before",
                        style="bold yellow", markup=False, soft_wrap=True)
@@ -305,27 +311,6 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         several = {"studies": documents, "report": None if index_path is None else str(index_path)}
         print_json(documents[0] if len(documents) == 1 and not report else several)
     return code
-
-
-def _made(folder: Path) -> Path:
-    """Create the output folder before the computation."""
-    from tdhil.errors import UsageError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"can't be made a folder ({error.strerror})", where=f"--out {folder}",
-                         entry=MessageCode.FILE_NOT_WRITABLE) from None
-    return folder
-
-
-def _cost(outcome: StudyOutcome, took_s: float) -> str:
-    """Return wall time, and time per simulated second; of the simulation alone if the study reports it."""
-    simulated_s = outcome.simulated_s
-    if simulated_s <= 0.0:
-        return f"{outcome.name}: {took_s:.1f} s"
-    each_ms = 1e3 * (outcome.simulation_wall_s or took_s) / simulated_s
-    return f"{outcome.name}: {took_s:.1f} s; {simulated_s:.0f} simulated seconds, {each_ms:.3g} ms each"
 
 
 def _list(studies: Mapping[str, Study], as_json: bool) -> int:
