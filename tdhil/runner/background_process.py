@@ -11,7 +11,11 @@ from tdhil.worker_process import serve
 
 def main() -> None:
     """Answer one request after the other until the pipe ends. `BackgroundProcess` runs this function."""
-    _take_second_place()
+    # Leave inherited real-time scheduling, and take a lower priority than the control loop.
+    with suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with suppress(AttributeError, OSError):
+        os.nice(NICE)
     serve(_load, caught=BaseException)
 
 
@@ -20,11 +24,3 @@ def _load() -> None:
     from tdhil.runner.preconditions import load_before_motion
 
     load_before_motion()
-
-
-def _take_second_place() -> None:
-    """Leave inherited real-time scheduling, and take a lower priority than the control loop."""
-    with suppress(AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    with suppress(AttributeError, OSError):
-        os.nice(NICE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Event
 from typing import TypeVar
 
 from drivers import (
@@ -174,7 +173,9 @@ class ControlLoop:
         try:
             while not background.ended.is_set():
                 if self.drive.clock.stepped:
-                    self._wait_alive(background.ended)
+                    self._stop_request.check()
+                    if not background.ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
+                        self.drive.keep_alive()
                 else:
                     cycle()
         except BaseException:
@@ -189,9 +190,3 @@ class ControlLoop:
     def no_worker_process(self, why: str) -> None:
         """Log that computations share this process with the control loop."""
         self.log.event(self.now_s, "host", f"{NO_WORKER_PROCESS}: {why}")
-
-    def _wait_alive(self, ended: Event) -> None:
-        """Wait `ALIVE_S` or until the work is done; then send a keep-alive message if the drive supports it."""
-        self._stop_request.check()
-        if not ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
-            self.drive.keep_alive()

@@ -100,7 +100,10 @@ class Runner:
         cause: BaseException | None = None
         report: StopReport | None = None
         try:
-            self._run_stages()
+            with ExitStack() as setup:
+                setup.enter_context(self._book.stage("setup", 10.0))
+                run, program = self._prepare(setup.close)
+                program(run)           # ends stage 1, and runs the others
         except BaseException as error:
             cause = error
             self._log_failure(error)
@@ -133,19 +136,15 @@ class Runner:
                         self._log.event(self._drive.clock.now_s(), "left", f"not restored: {line}")
             if self._worker_process is not None:
                 self._worker_process.close()
-            if cause is None:
+            if cause is None and self._before_echo:
+                # how the reported torque follows the commanded one: the estimate from before the echo needs it
                 with suppress(Exception):
-                    self._learn_torque_answer()
+                    answer = torque_answer(self._log.recording(complete=True), self._log.commanded_nm)
+                    if answer is not None:
+                        self._log.learn(torque_answer=answer)
         return RunOutcome(tuple(self._book.stages), cause, report, self._book.preflight)
 
     # -- the stages ------------------------------------------------------------------------------------------
-
-    def _run_stages(self) -> None:
-        """Connect and check in stage 1; the program that the task requests ends it and runs the others."""
-        with ExitStack() as setup:
-            setup.enter_context(self._book.stage("setup", 10.0))
-            run, program = self._prepare(setup.close)
-            program(run)
 
     def _armed(self, stop: StopSequence) -> None:
         self._stop = stop
@@ -163,7 +162,11 @@ class Runner:
         if self._reset_fault:
             self._log.event(self._drive.clock.now_s(), "reset", "fault reset, requested by the operator")
             self._drive.reset_fault()
-        no_worker_process = "" if self._drive.clock.stepped else self._make_ready()
+        no_worker_process = ""
+        if not self._drive.clock.stepped:
+            stop_request = self._stop_request
+            self._worker_process, no_worker_process = begin(load_before_motion, lambda: stop_request.signum is not None)
+            stop_request.check()
         preflight = self._check_drive(task)
         refuse_with_string(task.limits, task.request, preflight)
         task = replace(task, limits=keep_within(task.limits, task.request, preflight))
@@ -218,12 +221,24 @@ class Runner:
         self._say(said)
 
     def _set_rate(self, task: Task) -> Task:
-        """Choose the cycle rate. Return the task with what the host assumes at this rate."""
-        self._choose_rate()
+        """Choose the highest cycle rate that this computer sustains, if no rate is requested and its clock sets the
+        pace. Return the task with what the host assumes at the rate.
+        """
+        drive = self._drive
+        if isinstance(drive, Paced) and drive.rates_hz:
+
+            def cycle() -> Sample:
+                self._stop_request.check()
+                return drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+
+            choice = choose_rate(drive, drive.rates_hz, cycle)
+            self._log.event(drive.clock.now_s(), "rate", choice.text)
+            self._log.configure(rate_tried=choice.plain())
+            self._say(choice.text)
         # The rate of the line is known only now: the driver may have measured it in preflight.
-        period_s = self._drive.period_s
+        period_s = drive.period_s
         self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
-        self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles per second")
+        self._log.event(drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles per second")
         refuse_slow_reference(task.request, period_s)
         if task.case is None:
             _refuse_undersampled(task.request, period_s)
@@ -263,35 +278,6 @@ class Runner:
         if no_worker_process:
             loop.no_worker_process(no_worker_process)
         return loop
-
-    def _make_ready(self) -> str:
-        """Load modules and start the worker process. Return why there is no worker process; empty if there is one."""
-        stop_request = self._stop_request
-        self._worker_process, why = begin(load_before_motion, lambda: stop_request.signum is not None)
-        stop_request.check()
-        return why
-
-    def _choose_rate(self) -> None:
-        """Choose the highest rate that this computer sustains, if no rate is requested and its clock sets the pace."""
-        drive = self._drive
-        if not (isinstance(drive, Paced) and drive.rates_hz):
-            return
-
-        def cycle() -> Sample:
-            self._stop_request.check()
-            return drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
-
-        choice = choose_rate(drive, drive.rates_hz, cycle)
-        self._log.event(drive.clock.now_s(), "rate", choice.text)
-        self._log.configure(rate_tried=choice.plain())
-        self._say(choice.text)
-
-    def _learn_torque_answer(self) -> None:
-        """Record how the reported torque follows the commanded one: the estimate from before the echo needs it."""
-        if self._before_echo:
-            answer = torque_answer(self._log.recording(complete=True), self._log.commanded_nm)
-            if answer is not None:
-                self._log.learn(torque_answer=answer)
 
     def _log_failure(self, error: BaseException) -> None:
         try:

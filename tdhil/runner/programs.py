@@ -170,23 +170,18 @@ def turn(run: Run) -> Turning:
             f"rough model: J {model.inertia_kg_m2:.4g} kg·m² ± {100 * speed.rough.rel_error:.0f} %, "
             f"B {model.viscous_nm_s_rad:.3g} N·m·s/rad, T_c {model.coulomb_nm:.3g} N·m",
         )
-        prior = _note_timing(run, speed)
+        half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
+        if half_s <= 0.0:
+            prior = run.prior
+        else:                          # speed and torque may be offset by as much
+            prior = with_timing(run.prior, half_s)
+            log.learn(timing_half_width_s=half_s, lag_prior=prior)
+            text = f"sample times are known to ±{1e3 * half_s:.3g} ms, half the duration of a transaction"
+            log.event(loop.now_s, "rate", text)
         slow: tuple[Sample, ...] = ()
         if run.mode is Mode.TORQUE:
             slow, speed = slow_down(loop, limits, speed, run.assumptions, run.speed_resolution_rad_s)
     return Turning(speed, slow, prior)
-
-
-def _note_timing(run: Run, speed: SpeedResult) -> LagPrior:
-    """Log the uncertainty of the sample times. Return the prior with it: speed and torque may be offset by as much."""
-    half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
-    if half_s <= 0.0:
-        return run.prior
-    prior = with_timing(run.prior, half_s)
-    run.log.learn(timing_half_width_s=half_s, lag_prior=prior)
-    text = f"sample times are known to ±{1e3 * half_s:.3g} ms, half the duration of a transaction"
-    run.log.event(run.loop.now_s, "rate", text)
-    return prior
 
 
 def switch_to_torque(run: Run, turning: Turning) -> TorqueResult | None:

@@ -106,7 +106,9 @@ class StageBook:
             self._log.event(self._now_s(), "clock",
                             "the wall clock jumped: time stamps on the bus changed, the times in this log did not")
         if after.passive > before.passive:
-            self._tell_bus("the CAN adapter is error-passive. Check bit rate, termination and cable")
+            text = "the CAN adapter is error-passive. Check bit rate, termination and cable"
+            self._log.event(self._now_s(), "bus", text)
+            self._say(text)
         outcome, detail = stage_quality(before, after)
         self._end(Stage(name, start_s, self._now_s(), outcome, detail))
 
@@ -117,10 +119,6 @@ class StageBook:
 
     def _now_s(self) -> float:
         return self._drive.clock.now_s()
-
-    def _tell_bus(self, text: str) -> None:
-        self._log.event(self._now_s(), "bus", text)
-        self._say(text)
 
     def _announce(self, name: str) -> None:
         """Announce a stage to the drive: a simulated peer triggers its scripted faults by it."""

@@ -16,7 +16,7 @@ from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.design import DesignKnowledge, NoiseDensity, assumed_noise, measured_noise
-from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SpeedChangePlan, leaves_time_before_echo
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, leaves_time_before_echo
 from tdhil.runner.guard import LIGHTEN, Guard
 from tdhil.runner.interim import Identify
 from tdhil.runner.planning import Planned, as_followed, plan_acquisition
@@ -90,7 +90,20 @@ class StagePlanner:
                 entry=MessageCode.BRAKING_UNCLEAR,
             )
         if course is not None:
-            self._note_following(plan)
+            following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
+            if math.isfinite(ramp):
+                self._report(
+                    f"the drive's own speed ramp limits the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
+            if following is None:
+                self._report(
+                    "the drive's response to its setpoint is not clear; stage 5 assumes that it follows at once")
+            else:
+                # identification needs them for the effect of a stepped, slowly sampled setpoint on J
+                self._log.learn(
+                    stepped_setpoint=SteppedSetpoint(
+                        loop.period_s, following.zero_s, following.first_s, following.second_s2
+                    )
+                )
         self._display.planned(plan)
         self._log.event(
             loop.now_s,
@@ -124,20 +137,6 @@ class StagePlanner:
 
         assert isinstance(planned.plan, Plan)
         return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note, identify=identify)
-
-    def _note_following(self, plan: Plan | SpeedChangePlan) -> None:
-        """Log the data that identification needs for the effect of a stepped, slowly sampled setpoint on J."""
-        following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
-        if math.isfinite(ramp):
-            self._report(f"the drive's own speed ramp limits the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
-        if following is None:
-            self._report("the drive's response to its setpoint is not clear; stage 5 assumes that it follows at once")
-            return
-        self._log.learn(
-            stepped_setpoint=SteppedSetpoint(
-                self._loop.period_s, following.zero_s, following.first_s, following.second_s2
-            )
-        )
 
     def _report(self, text: str) -> None:
         self._log.event(self._loop.now_s, "plan", text)
