@@ -367,11 +367,9 @@ EQUIVALENT = {
         "a stop is seen once more by the Runner, before it moves anything; here it only comes sooner",
     "service/attendance.py, _write: self._wake.clear()":
         "the thread then writes the same status again and again: a core is lost, and nothing else",
-    "guard.py, _side_of: return 0.0": _ONLY_SOONER,
     "canopen/drive.py, check: if watch.quiet:": _ONLY_SOONER,
     "canopen/drive.py, check: return": _ONLY_SOONER,
     "string_release.py, __init__: self._mean_nm = self._smooth_nm = 0.0 (last)": "the first step sets both",
-    "string_release.py, _yielding: assert self._reference_nm is not None": "says to mypy what its caller has just set",
 }
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""
 

@@ -263,10 +263,18 @@ class Guard:
         if self.observer.doubt is not None:
             self._raise_doubt(self.observer.doubt, sample)
         in_torque_mode = command.mode is Mode.TORQUE
-        if in_torque_mode and sample.limit_active:
-            self._check_limited(sample)
-        else:
+        if not (in_torque_mode and sample.limit_active):
             self._limited_since_s = None
+        elif self._limited_since_s is None:
+            self._limited_since_s = sample.time_s
+        elif sample.time_s - self._limited_since_s >= LIMITED_S:
+            raise LimitHit(
+                f"the drive's internal limit has been active in torque mode for the limit of {LIMITED_S:g} s:"
+                " its torque is not the commanded one",
+                where=f"statusword {sample.status:04X}h, bit 11, at {sample.time_s:.3f} s",
+                next_step="The shaft was stopped. Check on its panel which limit acts",
+                entry=MessageCode.SETPOINT_NOT_FOLLOWED,
+            )
         if self.expected is PowerState.ENABLED and not in_torque_mode and not self.torque_offset_nm > 0.0:
             self._check_following(command, sample)
         else:
@@ -440,18 +448,6 @@ class Guard:
                 entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )
 
-    def _check_limited(self, sample: Sample) -> None:
-        if self._limited_since_s is None:
-            self._limited_since_s = sample.time_s
-        elif sample.time_s - self._limited_since_s >= LIMITED_S:
-            raise LimitHit(
-                f"the drive's internal limit has been active in torque mode for the limit of {LIMITED_S:g} s:"
-                " its torque is not the commanded one",
-                where=f"statusword {sample.status:04X}h, bit 11, at {sample.time_s:.3f} s",
-                next_step="The shaft was stopped. Check on its panel which limit acts",
-                entry=MessageCode.SETPOINT_NOT_FOLLOWED,
-            )
-
 
 class _ModeShown:
     """Compares the mode that the drive displays with the commanded one."""
@@ -519,22 +515,18 @@ class _Following:
             self._blocks[-1].widen(reference_rad_s)
         self._speeds.append(sample.speed_rad_s)
         self._torques.append(sample.torque_nm)
-        speed_rad_s = self.speed_rad_s
-        side = self._side_of(speed_rad_s)
+        speed_rad_s, latest, window_rad_s = self.speed_rad_s, self._blocks[-1], self._window_rad_s
+        if latest.lowest - window_rad_s <= speed_rad_s and speed_rad_s - latest.highest <= window_rad_s:
+            side = 0.0           # the usual case; earlier blocks only widen it
+        elif speed_rad_s < min(block.lowest for block in self._blocks) - window_rad_s:
+            side = 1.0
+        else:
+            side = -1.0 if speed_rad_s - max(block.highest for block in self._blocks) > window_rad_s else 0.0
         if side != self._side:
             self._side, self._anchor_rad_s, self._anchor_s, self.since_s = side, speed_rad_s, now_s, now_s
         elif side * (speed_rad_s - self._anchor_rad_s) >= self._nearer_rad_s:
             self._anchor_rad_s, self._anchor_s = speed_rad_s, now_s
         return side == 0.0 or now_s - self._anchor_s < self.within_s
-
-
-    def _side_of(self, speed_rad_s: float) -> float:
-        latest, window_rad_s = self._blocks[-1], self._window_rad_s
-        if latest.lowest - window_rad_s <= speed_rad_s and speed_rad_s - latest.highest <= window_rad_s:
-            return 0.0           # the usual case; earlier blocks only widen it
-        if speed_rad_s < min(block.lowest for block in self._blocks) - window_rad_s:
-            return 1.0
-        return -1.0 if speed_rad_s - max(block.highest for block in self._blocks) > window_rad_s else 0.0
 
 
 class _Block:

@@ -510,8 +510,10 @@ class StopSequence:
         next: it brakes there, the drive left torque mode, or standstill was not seen.
         """
         string = self._string
-        if self._speed_doubted and string is None:
-            self._take_torque_back()
+        if self._speed_doubted and string is None and self._in_torque_mode:
+            # With a speed signal that does not respond, speed control would continue to hold the flowing torque.
+            for _ in range(self._loop.cycles(TORQUE_BACK_S)):
+                self._exchange(Command(Mode.TORQUE, 0.0, 0.0))
         if self._quick_stop_in_torque_mode:
             return None
         # With a string and a believed speed, `_slow_down` has given the drive its time.
@@ -581,16 +583,6 @@ class StopSequence:
         disabled = self._remove_torque(_NO_TORQUE_ASKED)
         stays = disabled and self._stays_at_rest()
         return self._ended(stays, at_rest_s, disabled)
-
-    def _take_torque_back(self) -> None:
-        """Command zero torque in torque mode before the quick stop.
-
-        With a speed signal that does not respond, speed control would continue to hold the flowing torque.
-        """
-        if not self._in_torque_mode:
-            return
-        for _ in range(self._loop.cycles(TORQUE_BACK_S)):
-            self._exchange(Command(Mode.TORQUE, 0.0, 0.0))
 
     @property
     def _never_moved(self) -> bool:

@@ -169,16 +169,12 @@ class StringRelease:
         calm = abs(held_nm) <= self._limits.residual_nm and still
         self._quiet_s = self._quiet_s + self._period_s if calm else 0.0
         self._impedance.watch(held_nm, self._period_s, torque_nm if self._still_s < MEAN_S else 0.0)
-        speed = self._yielding(torque_nm)
-        self.travel_rad += speed * self._period_s
-        return speed
-
-    def _yielding(self, torque_nm: float) -> float:
-        assert self._reference_nm is not None
         # The ramp belongs to the side on which the torque was trapped; torque of the other sign is released at once.
         same_side = torque_nm * self.trapped_nm > 0.0
         excess_nm = max(0.0, abs(torque_nm) - (self._reference_nm if same_side else 0.0))
-        return -math.copysign(min(self._fastest_rad_s, excess_nm / self._impedance.nm_s_rad), torque_nm)
+        speed = -math.copysign(min(self._fastest_rad_s, excess_nm / self._impedance.nm_s_rad), torque_nm)
+        self.travel_rad += speed * self._period_s
+        return speed
 
 
 MEAN_TORQUE_S = 8.0
