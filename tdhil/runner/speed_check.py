@@ -108,7 +108,10 @@ class Angles:
             if step != 0.0:
                 self.count_rad = abs(step) if self.count_rad is None else min(self.count_rad, abs(step))
         self._raw_rad = reading.position_rad
-        point = self._last = _AnglePoint(reading.time_s, angle, self._way_at(reading.time_s), reading.half_width_s)
+        way_rad = self._way_rad
+        if self._before is not None:       # a late host reads the position after its last sample
+            way_rad += self._before.speed_rad_s * (reading.time_s - self._before.time_s)
+        point = self._last = _AnglePoint(reading.time_s, angle, way_rad, reading.half_width_s)
         self._recent.append(point)
         while len(self._recent) > LEAST_WINDOW + 1 and point.time_s - self._recent[1].time_s >= WINDOW_S:
             del self._recent[0]
@@ -117,12 +120,6 @@ class Angles:
         elif last is not None and angle != last.angle_rad:
             self._changed = self._changed or point
             self._changed_last = point
-
-    def _way_at(self, time_s: float) -> float:
-        """Return the reported travel at the time of a reading: a late host reads the position after its last sample."""
-        if self._before is None:
-            return self._way_rad
-        return self._way_rad + self._before.speed_rad_s * (time_s - self._before.time_s)
 
     def speed_rad_s(self) -> tuple[float, float] | None:
         """Return the least and most speed (magnitudes) by the latest positions alone; None if it is too early."""
@@ -271,7 +268,9 @@ class SpeedUnitCheck:
     def level(self) -> None:
         """Begin the operating point at the first mean speed: the comparison starts here."""
         self._angles.restart()
-        if not self._wraps_soon():
+        # A wrapping position would be lost if it were read less often.
+        low_rad_s, wraps_rad = max(self._highest_rad_s, self._slow_rad_s), self._wraps_rad
+        if wraps_rad is None or not 0.5 * wraps_rad < SEEN_FASTER * low_rad_s * LEVEL_EVERY_S:
             self._every_s = max(LEVEL_EVERY_S, self._every_s)
 
     def conclude(self, command: Command) -> None:
@@ -326,12 +325,16 @@ class SpeedUnitCheck:
             return                                 # the time of this reading is too uncertain: use the next one
         angles.read(reading, max(self._highest_rad_s, abs(sample.speed_rad_s)))
         self._wraps_rad = reading.wraps_rad
-        self._refuse_fastest(command, sample)
-
-    def _wraps_soon(self) -> bool:
-        """Return whether a wrapping position would be lost if it were read less often."""
-        low_rad_s = max(self._highest_rad_s, self._slow_rad_s)
-        return self._wraps_rad is not None and 0.5 * self._wraps_rad < SEEN_FASTER * low_rad_s * LEVEL_EVERY_S
+        seen, fastest = angles.speed_rad_s(), FASTEST_SHARE * self._limits.speed_max_rad_s
+        believed = max(abs(command.speed_rad_s), abs(sample.speed_rad_s))
+        if seen is None or seen[0] <= fastest or seen[0] <= TOO_FAST * believed:
+            return
+        self._refuse(
+            f"the position of the shaft moves at {seen[0]:.3g} rad/s or more, where {command.speed_rad_s:.3g} rad/s are"
+            f" commanded and {sample.speed_rad_s:.3g} rad/s reported: the unit of speed is too small by a factor of"
+            f" about {seen[0] / believed:.2g}",
+            command,
+        )
 
     def _coarse(self) -> bool:
         """Return whether the position has not moved yet, or moves in steps too large for a speed."""
@@ -351,18 +354,6 @@ class SpeedUnitCheck:
         seen = self._angles.speed_rad_s()
         harmless = HARMLESS_SHARE * self._limits.speed_max_rad_s
         return seen is not None and seen[0] > max(TOO_FAST * abs(wanted_rad_s), harmless)
-
-    def _refuse_fastest(self, command: Command, sample: Sample) -> None:
-        seen, fastest = self._angles.speed_rad_s(), FASTEST_SHARE * self._limits.speed_max_rad_s
-        believed = max(abs(command.speed_rad_s), abs(sample.speed_rad_s))
-        if seen is None or seen[0] <= fastest or seen[0] <= TOO_FAST * believed:
-            return
-        self._refuse(
-            f"the position of the shaft moves at {seen[0]:.3g} rad/s or more, where {command.speed_rad_s:.3g} rad/s are"
-            f" commanded and {sample.speed_rad_s:.3g} rad/s reported: the unit of speed is too small by a factor of"
-            f" about {seen[0] / believed:.2g}",
-            command,
-        )
 
     # -- waiting, comparing, asking --------------------------------------------------------------------------
 

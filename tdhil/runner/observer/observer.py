@@ -326,7 +326,9 @@ class Observer:
 
     def begin_stop(self) -> None:
         """Note that a quick stop was requested: the shaft must decelerate from now on."""
-        self._runaway.begin(self._earlier_rad_s())
+        # the speed before the effect of a contradiction
+        earlier = (point.speed for point in self._points if self._time_s - point.time_s <= BEFORE_S)
+        self._runaway.begin(next(earlier, 0.0))
 
     def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
         """Return the time for which a disabled shaft must show standstill, s; ``torque_nm``: torque that held it
@@ -390,7 +392,14 @@ class Observer:
         self._block_from_s, self._cycles, self._sum_speed, self._sum_torque = sample.time_s, 0, 0.0, 0.0
         self._points.append(point)
         known.learn(self._points)
-        self._note_unseen(point, sample, block_s)
+        if not self._moved and (abs(point.speed) > 2.0 * self._still_rad_s or self._angles.moved):
+            self._moved = True
+            known.breakaway_nm = max(self._unseen_nm, abs(point.torque))
+            self._points.clear()       # the torque that held the shaft before is unknown
+            self._points.append(point)
+        elif not self._moved and sample.state is PowerState.ENABLED:
+            self._unseen_nms += abs(point.torque) * block_s
+            self._unseen_nm = max(self._unseen_nm, abs(point.torque))
         if self._revival is not None:
             self._revival.see(point.time_s, point.speed)
         if self._angle_revival is not None and (rate := self._angles.rate_rad_s) is not None:
@@ -456,18 +465,6 @@ class Observer:
         margin = half + FRICTION_LIMIT_SHARE * self._limits.torque_nm
         point.load_low, point.load_high = middle - margin, middle + margin
 
-    def _note_unseen(self, point: Point, sample: Sample, block_s: float) -> None:
-        if self._moved:
-            return
-        if abs(point.speed) > 2.0 * self._still_rad_s or self._angles.moved:
-            self._moved = True
-            self._bounds.breakaway_nm = max(self._unseen_nm, abs(point.torque))
-            self._points.clear()       # the torque that held the shaft before is unknown
-            self._points.append(point)
-        elif sample.state is PowerState.ENABLED:
-            self._unseen_nms += abs(point.torque) * block_s
-            self._unseen_nm = max(self._unseen_nm, abs(point.torque))
-
     def _left_operation_in_motion(self, now_s: float) -> bool:
         """Return whether the drive left operation by itself while the shaft turned: it removed its torque, or brakes
         after a fault.
@@ -507,10 +504,6 @@ class Observer:
         """Return the noise of a point's speed, rad/s."""
         per_point = max(1.0, self._point_s / self._period_s)
         return NOISE_SDS * math.sqrt(self._bent / 6.0 / per_point) + self._count_rad_s
-
-    def _earlier_rad_s(self) -> float:
-        """Return the reported speed `BEFORE_S` ago, rad/s: before the effect of a contradiction."""
-        return next((point.speed for point in self._points if self._time_s - point.time_s <= BEFORE_S), 0.0)
 
     def _see_angle(
         self, position_rad: float, now_s: float, speed_rad_s: float, zero: Unwrapped | None = None

@@ -109,20 +109,16 @@ class PositionWay:
         self._apart = self._apart + 1 if apart else 0
         if self._apart < IN_A_ROW:
             return None
-        return (
+        words = (
             f"reported position and reported speed contradict each other: within {took_s:.1f} s the position moved by"
             f" {turned:.2f} rad, and the reported speed accounts for {reported:.2f} rad"
-            + self._filter_in_words(turned - reported, self.ratio * (way.speed_rad_s - first[2].speed_rad_s))
         )
-
-    def _filter_in_words(self, missing_rad: float, change_rad_s: float) -> str:
-        """Return the lag of the reported speed that would explain the missing angle; empty if no filter is that
-        slow. A speed with the lag τ that rises by Δω misses τ Δω.
-        """
-        lag_s = missing_rad / change_rad_s if change_rad_s != 0.0 else 0.0
-        if not self._lag_s < lag_s <= SLOWEST_FILTER_S:
-            return ""
-        return f". A filter of the reported speed with a lag of {lag_s:.1f} s would explain this"
+        # A speed with the lag τ that rises by Δω misses τ Δω.
+        change_rad_s = self.ratio * (way.speed_rad_s - first[2].speed_rad_s)
+        lag_s = (turned - reported) / change_rad_s if change_rad_s != 0.0 else 0.0
+        if self._lag_s < lag_s <= SLOWEST_FILTER_S:
+            words += f". A filter of the reported speed with a lag of {lag_s:.1f} s would explain this"
+        return words
 
     def _allowed_rad(
         self, late_rad: float, turned_rad: float, reported_rad: float, took_s: float, noise_rad_s: float

@@ -83,7 +83,14 @@ class Runaway:
         """
         if not self.begun or self._before is None or point.time_s <= self._before.time_s:
             return None
-        self._see_unanswered(point, point.time_s - self._before.time_s)
+        braking_nm = -point.torque * math.copysign(1.0, point.speed)
+        opposes = braking_nm >= AT_LIMIT_SHARE * self._limits.torque_nm
+        changed = abs(point.speed - self._unanswered_rad_s) > UNANSWERED_SHARE * abs(point.speed)
+        turns = abs(point.speed) > STANDSTILLS * self._still_rad_s
+        if changed or not opposes or not turns:
+            self._unanswered_s, self._unanswered_rad_s = 0.0, point.speed
+        else:
+            self._unanswered_s += point.time_s - self._before.time_s
         if self._unanswered_s < UNANSWERED_S:
             return None
         return Contradiction(
@@ -151,17 +158,6 @@ class Runaway:
         least_nms, most_nms = known.inertia_low * change, known.inertia_high * change
         slack_nms = INVERTED_SHARE * abs(pushed_nms)
         self._inverted = least_nms - slack_nms <= expected_nms <= most_nms + slack_nms
-
-    def _see_unanswered(self, point: Point, took_s: float) -> None:
-        """Measure the time for which a torque at its limit opposes a reported speed that does not change."""
-        braking_nm = -point.torque * math.copysign(1.0, point.speed)
-        opposes = braking_nm >= AT_LIMIT_SHARE * self._limits.torque_nm
-        changed = abs(point.speed - self._unanswered_rad_s) > UNANSWERED_SHARE * abs(point.speed)
-        turns = abs(point.speed) > STANDSTILLS * self._still_rad_s
-        if changed or not opposes or not turns:
-            self._unanswered_s, self._unanswered_rad_s = 0.0, point.speed
-            return
-        self._unanswered_s += took_s
 
     def seen(self, belief: Belief, sample: Sample) -> str:
         """Return the evidence of acceleration in words if two ways agree; else ''."""

@@ -233,7 +233,11 @@ class IgnoredYield:
             return None
         # the response to the latest command is still missing, and changes from cycle to cycle are torque noise
         until_s = point.time_s - 2.0 * self._lag_s
-        commanded = _means([(time_s, one) for time_s, one, _ in seen if time_s <= until_s], SMOOTH_S)
+        before = [(time_s, one) for time_s, one, _ in seen if time_s <= until_s]
+        blocks: dict[int, list[float]] = {}
+        for time_s, one in before:
+            blocks.setdefault(math.floor((time_s - before[0][0]) / SMOOTH_S), []).append(one)
+        commanded = [math.fsum(block) / len(block) for block in blocks.values()]
         if not commanded:              # the lag is longer than half of what is kept
             return None
         went = [one for _, _, one in seen]
@@ -253,11 +257,3 @@ class IgnoredYield:
             " rad/s",
             "Check the encoder and its cable. Is the shaft held by a brake?", point.time_s,
         )
-
-
-def _means(values: list[tuple[float, float]], over_s: float) -> list[float]:
-    """Return the means of (time, value) over blocks of this length, s."""
-    blocks: dict[int, list[float]] = {}
-    for time_s, value in values:
-        blocks.setdefault(math.floor((time_s - values[0][0]) / over_s), []).append(value)
-    return [math.fsum(block) / len(block) for block in blocks.values()]

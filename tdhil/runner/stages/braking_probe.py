@@ -171,7 +171,11 @@ def plan_pulse(
     )
     wanted_s = wanted_rad_s * model.inertia_kg_m2 / change_nm
     longest_s = min(max(wanted_s, period_s), LONGEST_S, up_s, down_s)
-    edge = _edge_cycles(limits, change_nm, min(up_s, down_s), period_s)
+    edge = 0         # cycles of a ramp, none without a string
+    if limits.has_drill_string:            # both ramps and a cycle take at most the shorter of both times
+        edge_s = change_nm / limits.torque_ramp_nm_s if limits.torque_ramp_nm_s > 0.0 else STRING_EDGE_S
+        room = (_whole(min(up_s, down_s), period_s) - 1) // 2
+        edge = max(0, min(round(min(edge_s, STRING_EDGE_S) / period_s), room))
     # Both ramps together act like the full torque for the time of one ramp, and the drive may invert both.
     cycles = max(1, min(_whole(longest_s, period_s) - edge, _whole(up_s, period_s) - 2 * edge))
     slowing = change_nm * (cycles + edge) * period_s / model.inertia_kg_m2
@@ -194,15 +198,6 @@ def plan_pulse(
         )
     highest = before.speed_rad_s + limits.torque_nm / lightest * exposed_s
     return Pulse(before.flowing_nm, -braking_nm, cycles, edge, slowing, highest)
-
-
-def _edge_cycles(limits: MachineLimits, change_nm: float, longest_s: float, period_s: float) -> int:
-    """Return the cycles of a ramp, none without a string; both ramps and a cycle take at most ``longest_s``."""
-    if not limits.has_drill_string:
-        return 0
-    wanted_s = change_nm / limits.torque_ramp_nm_s if limits.torque_ramp_nm_s > 0.0 else STRING_EDGE_S
-    room = (_whole(longest_s, period_s) - 1) // 2
-    return max(0, min(round(min(wanted_s, STRING_EDGE_S) / period_s), room))
 
 
 def _whole(time_s: float, period_s: float) -> int:
