@@ -270,7 +270,9 @@ def choose(
     allowed_s = _SLACK * usual.duration_s if time_s is None else time_s
     if known.has_drill_string and _lines_are_free(wish):
         try:
-            return Choice(_for_string(limits, guess, wish, allowed_s), math.nan, math.nan)
+            shape = phased(STRING, limits, guess, wish.mode)
+            asked = replace(wish, shape=shape, frequency_hz=STRING.lowest_hz, offset_share=OFFSET_SHARES[0])
+            return Choice(_in_time(make_plan(limits, guess, asked), asked, allowed_s), math.nan, math.nan)
         except PlanRefused:        # such as: too long for the available time
             pass
     if _fixed(wish):
@@ -387,12 +389,6 @@ def refuse_unfit(
 
 
 STRING = Proposal(0.08, tuple(range(1, 11)), 1.0)
-
-
-def _for_string(limits: MotionLimits, guess: RigGuess, wish: PlanRequest, time_s: float) -> Plan:
-    shape = phased(STRING, limits, guess, wish.mode)
-    asked = replace(wish, shape=shape, frequency_hz=STRING.lowest_hz, offset_share=OFFSET_SHARES[0])
-    return _in_time(make_plan(limits, guess, asked), asked, time_s)
 
 
 def _candidates(

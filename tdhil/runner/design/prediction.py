@@ -104,10 +104,22 @@ def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noi
     frequencies: list[FloatArray] = []
     readings: list[FloatArray] = []
     for samples in steady:
-        read = _readings(samples, theta)
-        if read is not None:
-            frequencies.append(read[0])
-            readings.append(read[1])
+        if len(samples) < 4 * _HIGH_LINES:
+            continue
+        interval = float(np.median(np.diff(samples.time_s)))
+        begin, length = float(samples.time_s[0]), float(samples.time_s[-1] - samples.time_s[0]) + interval
+        harmonics = np.arange(1.0, _HIGH_LINES + 1.0) / length
+        lines = tuple(float(one) for one in harmonics)
+        segment = Segment(begin, begin + length, length, 0, float(np.mean(samples.speed_rad_s)), lines, (), ())
+        try:
+            found = period_lines(Stretch(segment, (samples,), (0,)), samples)
+        except np.linalg.LinAlgError:       # the samples can't separate these frequencies
+            continue
+        torque = found.torque[0] - theta[1] * found.drift[0] * found.ramp[0]
+        s = 2j * np.pi * harmonics.astype(np.complex128)
+        error = torque - RIGID.impedance(theta, s) * found.speed[0]
+        frequencies.append(harmonics)
+        readings.append(np.abs(error) ** 2 * length / 4.0)
     if not readings:
         return fallback
     hertz, density = np.concatenate(frequencies), np.concatenate(readings)
@@ -119,26 +131,6 @@ def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noi
     if not (math.isfinite(load) and math.isfinite(speed)):
         return fallback
     return NoiseDensity(max(load, _LEAST_SHARE * fallback.load_nm2_s), max(speed, 0.0), source="measured")
-
-
-def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return frequencies, Hz, and estimates of S, (K,) each, of one stretch; None if it is too short."""
-    if len(samples) < 4 * _HIGH_LINES:
-        return None
-    interval = float(np.median(np.diff(samples.time_s)))
-    begin, length = float(samples.time_s[0]), float(samples.time_s[-1] - samples.time_s[0]) + interval
-    hertz = np.arange(1.0, _HIGH_LINES + 1.0) / length
-    lines = tuple(float(one) for one in hertz)
-    segment = Segment(begin, begin + length, length, 0, float(np.mean(samples.speed_rad_s)), lines, (), ())
-    try:
-        found = period_lines(Stretch(segment, (samples,), (0,)), samples)
-    except np.linalg.LinAlgError:       # the samples can't separate these frequencies
-        return None
-    torque = found.torque[0] - theta[1] * found.drift[0] * found.ramp[0]
-    s = 2j * np.pi * hertz.astype(np.complex128)
-    error = torque - RIGID.impedance(theta, s) * found.speed[0]
-    readings: FloatArray = np.abs(error) ** 2 * length / 4.0
-    return hertz, readings
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -200,9 +200,18 @@ def make_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest | None = 
     Raises PlanRefused, with the limit, if the request does not fit.
     """
     wish = wish or PlanRequest()
-    shape, frequency = _shape_and_frequency(wish)
+    kind = periodic_kind(wish.kind)
+    frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
+    if not (math.isfinite(frequency) and frequency > 0.0):
+        raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
+    if identified_before_echo(wish.kind) and frequency > kind.frequency_hz:
+        raise PlanRefused(
+            f"{wish.kind} with lines {frequency:g} Hz apart can't separate an echo from the time before it",
+            f"Remove --frequency ({kind.frequency_hz:g} Hz), or give a lower one",
+        )
+    shape = kind.shape() if wish.shape is None else wish.shape
     period = 1.0 / frequency
-    if wish.realisations > 1 and not periodic_kind(wish.kind).tuned:
+    if wish.realisations > 1 and not kind.tuned:
         raise PlanRefused(
             f"the phases of {wish.kind} are part of its form, so it has one realisation", "Remove --realisations",
         )
@@ -327,21 +336,6 @@ class _FittedShape:
             torque_min_nm=reference.mean_torque_nm - amplitude_rad_s * self.torque_down,
             torque_max_nm=reference.mean_torque_nm + amplitude_rad_s * self.torque_up,
         )
-
-
-def _shape_and_frequency(wish: PlanRequest) -> tuple[Shape, float]:
-    kind = periodic_kind(wish.kind)
-    frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
-    if not (math.isfinite(frequency) and frequency > 0.0):
-        raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
-    if identified_before_echo(wish.kind) and frequency > kind.frequency_hz:
-        raise PlanRefused(
-            f"{wish.kind} with lines {frequency:g} Hz apart can't separate an echo from the time before it",
-            f"Remove --frequency ({kind.frequency_hz:g} Hz), or give a lower one",
-        )
-    if wish.shape is not None:
-        return wish.shape, frequency
-    return kind.shape(), frequency
 
 
 def periodic_kind(name: str) -> PeriodicKind:

@@ -64,7 +64,13 @@ def fit_following(
     grid = np.arange(float(time_s[0]), float(time_s[-1]) + _GRID_S, _GRID_S)
     # A setpoint holds until the next one.
     at = np.clip(np.searchsorted(time_s, grid, side="right") - 1, 0, len(time_s) - 1)
-    wanted = _ramped((setpoint_rad_s[at] - begin) / change, ramp_rad_s2 / abs(change))
+    wanted, rate = (setpoint_rad_s[at] - begin) / change, ramp_rad_s2 / abs(change)
+    if not math.isinf(rate):           # 1/s
+        ramped, now = np.empty_like(wanted), float(wanted[0])
+        for index, target in enumerate(wanted.tolist()):
+            now += max(-rate * _GRID_S, min(rate * _GRID_S, target - now))
+            ramped[index] = now
+        wanted = ramped
     seen = (reported_rad_s - begin) / change
 
     def left(logs: FloatArray) -> FloatArray:
@@ -99,17 +105,6 @@ def held_back_to(
     if not (math.isfinite(took) and took > _HELD_BACK * asked > 0.0):
         return None
     return 0.6 * abs(change) / took
-
-
-def _ramped(wanted: FloatArray, rate: float) -> FloatArray:
-    """Return a setpoint on the grid with its rate limited to ``rate``, 1/s."""
-    if math.isinf(rate):
-        return wanted
-    found, now = np.empty_like(wanted), float(wanted[0])
-    for index, target in enumerate(wanted.tolist()):
-        now += max(-rate * _GRID_S, min(rate * _GRID_S, target - now))
-        found[index] = now
-    return found
 
 
 def _response(wanted: FloatArray, zero: float, first: float, second: float, lag: float) -> FloatArray:
