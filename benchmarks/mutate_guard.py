@@ -123,7 +123,7 @@ SUBJECTS = {
     ),
     "acquire": _run(
         "stages/acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_adaptive_duration.py",
-        within="Follower run_acquire _dither_of _SegmentCourse",
+        within="Follower run_acquire _SegmentCourse",
     ),
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_speed_changes _calm _coast"

@@ -129,7 +129,11 @@ def run_acquire(
     In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`). ``watch`` shows J after periods.
     """
     begun_s = loop.now_s
-    dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
+    width_rad_s, dither_period_s = plan.limits.width_rad_s, plan.segments[0].reference.period_s
+    peak_rad_s = dither_peak(speed_resolution_rad_s, width_rad_s) if plan.mode == Mode.SPEED.value else 0.0
+    dither_rad_s: Callable[[float], float] | None = (
+        None if peak_rad_s == 0.0 else lambda time_s: dither(time_s - begun_s, dither_period_s, peak_rad_s)
+    )
     after_cycle = None if watch is None else watch.look
     follower = Follower(loop, limits, Mode(plan.mode), control, dither_rad_s, after_cycle)
     course = _SegmentCourse(loop, plan, follower, announce, watch)
@@ -147,14 +151,6 @@ def run_acquire(
         for index in () if decision.at_last else course.others():
             course.go_to(index, decision.periods)
     announce(course.excitation)
-
-
-def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
-    peak_rad_s = dither_peak(resolution_rad_s, plan.limits.width_rad_s) if plan.mode == Mode.SPEED.value else 0.0
-    if peak_rad_s == 0.0:
-        return None
-    period_s = plan.segments[0].reference.period_s
-    return lambda time_s: dither(time_s - begun_s, period_s, peak_rad_s)
 
 
 class _SegmentCourse:
