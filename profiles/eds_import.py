@@ -46,12 +46,6 @@ def begin_profile(eds: EdsFile, path: str) -> Begun:
 
     Raises DataFileError if the file does not describe a CiA 402 drive that tdhil can use.
     """
-    _refuse_unless_possible(eds, path)
-    text = "\n".join(_Writer(eds).lines()) + "\n"
-    return Begun(text, parse_model(text, path, CanopenProfile))
-
-
-def _refuse_unless_possible(eds: EdsFile, path: str) -> None:
     problems = []
     kind = eds.get(0x1000)
     told = None if kind is None else kind.stands
@@ -66,6 +60,8 @@ def _refuse_unless_possible(eds: EdsFile, path: str) -> None:
             problems.append(Problem(path, one.line, f"{index:04X}h ({said}) is {one.type}: must be {kind_wanted}"))
     if problems:
         raise DataFileError(tuple(problems))
+    text = "\n".join(_Writer(eds).lines()) + "\n"
+    return Begun(text, parse_model(text, path, CanopenProfile))
 
 
 def _modes_told(eds: EdsFile) -> int | None:
@@ -109,11 +105,10 @@ class _Writer:
         yield "bus: canopen"
         yield "eds: null"
         yield f"node: {self._eds.node or 1}"
-        for part in (self._identity, self._modes, self._quick_stop, self._speed, self._torque, self._watchdog):
+        for part in (self._identity, self._modes, self._quick_stop, self._speed, self._torque, self._watchdog,
+                     self._cyclic):
             yield ""
             yield from part()
-        yield ""
-        yield from self._cyclic()
         yield ""
         yield from _comment(
             "Smoothing that the drive puts on the reported speed and torque: no EDS tells it. Look for filter, "

@@ -256,17 +256,15 @@ class _Reader:
         out = io.StringIO()
         for rank in range(4):
             for name, section in self._sections.items():
-                if _rank(name) == rank and not self._is_type_definition(name[:4]):
+                parent = self._sections.get(name[:4])
+                kind = parent.values.get("ObjectType", "") if parent else ""
+                # Object types 0, 5 and 6 only define a type.
+                if _rank(name) == rank and not (kind and int(kind, 0) in (0, 5, 6)):
                     out.write(f"[{name}]\n")
                     kept = _KEPT.get(name, section.values)
                     values = section.values | ({} if name in _KEPT else {"ParameterName": name})
                     out.writelines(_pair(key, values[key]) for key in kept if values.get(key))
         return out.getvalue()
-
-    def _is_type_definition(self, parent: str) -> bool:
-        section = self._sections.get(parent)
-        kind = section.values.get("ObjectType", "") if section else ""
-        return bool(kind) and int(kind, 0) in (0, 5, 6)
 
     def section_of(self, index: int, sub: int, *, alone: bool) -> tuple[str, int]:
         """Return (section that describes the subindex, its line)."""

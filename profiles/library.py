@@ -106,15 +106,10 @@ def parse_profile(text: str, name: str) -> Profile:
 @lru_cache(maxsize=64)
 def _parsed(text: str, name: str) -> Profile:
     """Parse a text once: the result is frozen, and a scan or a table needs all profiles."""
-    return parse_model(text, name, _schema(text, name))
-
-
-def _schema(text: str, name: str) -> type[Profile]:
-    """Return the schema for the bus that one plain line of the text names. The schema checks the key again."""
+    # One plain line of the text names the bus. The schema of this bus checks the key again.
     stated = _BUS.findall(text)
-    if len(stated) == 1 and stated[0] in SCHEMAS:
-        return SCHEMAS[stated[0]]
-    return SCHEMAS[parse_model(text, name, _Head).bus]
+    plain = len(stated) == 1 and stated[0] in SCHEMAS
+    return parse_model(text, name, SCHEMAS[stated[0] if plain else parse_model(text, name, _Head).bus])
 
 
 def load_canopen_profile(name_or_path: str) -> CanopenProfile:

@@ -147,7 +147,10 @@ def _explain(
             yield there, tree.line(there), message
     elif kind == "extra_forbidden":
         key, known = str(item["loc"][-1]), sorted(field_names(model, path[:-1]))
-        if said := _never_here(model, path[:-1]).get(key):
+        never_here: dict[str, str] = {}
+        for one in _models_at(model, path[:-1]):
+            never_here |= getattr(one, "never_here", {})
+        if said := never_here.get(key):
             yield path, tree.line(path), said
             return
         said = _meant(key, known, listed=path[:-1] not in listed)
@@ -156,7 +159,9 @@ def _explain(
         yield path[:-1], tree.line(path), f"unknown key '{_clean(key)}'{said}"
     elif kind == "missing":
         key = str(item["loc"][-1])
-        yield path, tree.line(path), f"'{key}' is missing{_description(model, path, key)}"
+        known_fields = (one.model_fields[key] for one in _models_at(model, path) if key in one.model_fields)
+        said = next((f" ({field.description})" for field in known_fields if field.description), "")
+        yield path, tree.line(path), f"'{key}' is missing{said}"
     else:
         said = _wrong_value(item, _value(tree.data, path), tree.written.get(path))
         yield path, tree.value_lines.get(path, tree.line(path)), said
@@ -273,20 +278,6 @@ def field_names(model: type[BaseModel], path: KeyPath) -> set[str]:
     return {info.alias or name for found in _models_at(model, path) for name, info in found.model_fields.items()}
 
 
-def _never_here(model: type[BaseModel], path: KeyPath) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for one in _models_at(model, path):
-        found |= getattr(one, "never_here", {})
-    return found
-
-
-def _description(model: type[BaseModel], path: KeyPath, key: str) -> str:
-    for found in _models_at(model, path):
-        if key in found.model_fields and (text := found.model_fields[key].description):
-            return f" ({text})"
-    return ""
-
-
 def _models_at(annotation: Any, path: KeyPath) -> Iterator[type[BaseModel]]:
     """Yield the models that are possible at ``path`` below ``annotation``."""
     origin = get_origin(annotation)
@@ -355,7 +346,7 @@ def settle(tree: Tree, error: ValidationError, model: type[BaseModel]) -> tuple[
 
 
 def _conversions(tree: Tree, path: KeyPath) -> list[Conversion]:
-    written = _at(tree.data, path)
+    written = _value(tree.data, path)
     key = next((part for part in reversed(path) if isinstance(part, str)), "")
     unit = quantities.unit_of_key(key)
     parts = quantities.split(written) if isinstance(written, str) else None
@@ -369,7 +360,7 @@ def _conversions(tree: Tree, path: KeyPath) -> list[Conversion]:
 
 
 def _key(tree: Tree, path: KeyPath, known: set[str]) -> list[Conversion]:
-    key, above = str(path[-1]), _at(tree.data, path[:-1])
+    key, above = str(path[-1]), _value(tree.data, path[:-1])
     ours = next((name for name in sorted(known) if quantities.same_quantity(key, name)), None)
     unit = quantities.unit_of_key(key)
     if ours is None or unit is None:
@@ -404,7 +395,7 @@ def _in_unit(text: str, unit: Unit) -> float:
 
 
 def _put(tree: Tree, path: KeyPath, there: KeyPath, written: str, value: float, unit: Unit) -> Conversion:
-    above = _at(tree.data, path[:-1])
+    above = _value(tree.data, path[:-1])
     if path != there:
         above.pop(path[-1])
         tree.lines[there] = tree.lines[path]
@@ -418,7 +409,7 @@ def _refused(tree: Tree, path: KeyPath, message: str, instead: KeyPath | None = 
     """Add a problem with its own message, and remove the key. The key ``instead``, which it stands for, is not reported
     as missing.
     """
-    above = _at(tree.data, path[:-1])
+    above = _value(tree.data, path[:-1])
     tree.problems.append(Problem(tree.file, tree.line(path), message))
     above.pop(path[-1])
     if instead is not None:
@@ -429,12 +420,6 @@ def _refused(tree: Tree, path: KeyPath, message: str, instead: KeyPath | None = 
 
 def _key_path(path: KeyPath) -> str:
     return ".".join(map(str, path))
-
-
-def _at(data: Any, path: KeyPath) -> Any:
-    for part in path:
-        data = data[part]
-    return data
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -83,7 +83,10 @@ def _number(text: str) -> Scalar:
     if len(text) > MAX_NUMBER_LENGTH:
         raise ValueError(f"a number of {len(text)} characters; at most {MAX_NUMBER_LENGTH} are read")
     if zeros := _LEADING_ZERO.fullmatch(text):
-        raise ValueError(_leading_zero(text, zeros[1], zeros[2]))
+        sign, digits = zeros[1], zeros[2]
+        octal = f" or 0o{digits}" if not sign and not set(digits) & set("89") else ""
+        raise ValueError(f"{text} is ambiguous (octal in YAML 1.1, decimal in YAML 1.2); write {sign}{digits}{octal},"
+                         " or put text in quotes")
     if _INT.fullmatch(text):
         return int(text)
     if _OCTAL.fullmatch(text) or _HEX.fullmatch(text):
@@ -92,12 +95,6 @@ def _number(text: str) -> Scalar:
     if not math.isfinite(value):
         raise ValueError(f"{text} is too large for a number")
     return value
-
-
-def _leading_zero(text: str, sign: str, digits: str) -> str:
-    decimal = f"write {sign}{digits}"
-    octal = f" or 0o{digits}" if not sign and not set(digits) & set("89") else ""
-    return f"{text} is ambiguous (octal in YAML 1.1, decimal in YAML 1.2); {decimal}{octal}, or put text in quotes"
 
 
 def hint(text: str) -> str:
@@ -292,7 +289,9 @@ def read_tree(text: str, file: str) -> Tree:
     tree = Tree(file)
     loader: Any = None
     try:
-        _check_characters(text)
+        if bad := yaml.SafeLoader.NON_PRINTABLE.search(text):
+            raise BrokenYaml(text.count("\n", 0, bad.start()) + 1,
+                             f"the character U+{ord(bad.group()):04X} is not allowed")
         loader = yaml.SafeLoader(text)
         events = iter(loader.get_event, None)
         assert isinstance(next(events), StreamStartEvent)
@@ -306,11 +305,6 @@ def read_tree(text: str, file: str) -> Tree:
         line = loader.line + 1 if loader is not None else 0
         tree.problems.append(Problem(file, line, f"not YAML ({str(error).splitlines()[0]})"))
     return tree
-
-
-def _check_characters(text: str) -> None:
-    if bad := yaml.SafeLoader.NON_PRINTABLE.search(text):
-        raise BrokenYaml(text.count("\n", 0, bad.start()) + 1, f"the character U+{ord(bad.group()):04X} is not allowed")
 
 
 def _line(event: Event) -> int:
