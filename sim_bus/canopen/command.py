@@ -63,52 +63,43 @@ def run(namespace: argparse.Namespace) -> int:
 @contextlib.contextmanager
 def _open_bus(namespace: argparse.Namespace) -> Iterator[tuple["can.BusABC", str]]:
     """Open the bus. Yield it with a text on how other programs reach it."""
-    bus, reached_by = _hub_bus(*namespace.hub) if namespace.hub is not None else _can_bus(namespace)
+    bus: can.BusABC
+    if namespace.hub is not None:
+        from sim_bus.canopen.socketcand import Hub, HubPort
+
+        host, port = namespace.hub
+        try:
+            hub = Hub(host, port)
+        except OSError as error:
+            raise Unusable(f"can't open a hub at {host}:{port}: {error.strerror or error}") from error
+        bus, reached_by = HubPort(hub), f"socketcand {hub.host}:{hub.port} channel {hub.channel}"
+    else:
+        bus, reached_by = _can_bus(namespace)
     try:
         yield bus, reached_by
     finally:
         bus.shutdown()
 
 
-def _hub_bus(host: str, port: int) -> tuple["can.BusABC", str]:
-    from sim_bus.canopen.socketcand import Hub, HubPort
-
-    try:
-        hub = Hub(host, port)
-    except OSError as error:
-        raise Unusable(f"can't open a hub at {host}:{port}: {error.strerror or error}") from error
-    return HubPort(hub), f"socketcand {hub.host}:{hub.port} channel {hub.channel}"
-
-
 def _can_bus(namespace: argparse.Namespace) -> tuple["can.BusABC", str]:
+    import can.util
     from can.cli import create_bus_from_namespace
 
-    if not hasattr(namespace, "interface") and not hasattr(namespace, "channel") and not _configured():
-        raise Unusable("no bus: give -i and -c, or --hub HOST:PORT, or configure python-can")
+    if not hasattr(namespace, "interface") and not hasattr(namespace, "channel"):
+        try:                 # python-can finds an interface in its files or in CAN_* variables
+            can.util.load_config()
+        except can.CanInterfaceNotImplementedError:
+            raise Unusable("no bus: give -i and -c, or --hub HOST:PORT, or configure python-can") from None
     given = dict(getattr(namespace, "bus_kwargs", None) or {})
     if getattr(namespace, "interface", None) == "socketcand" and {"host", "port"} <= given.keys():
-        _probe(str(given["host"]), int(given["port"]))
+        # Check the server first: python-can would try for ten seconds, at full load, to reach a missing server.
+        host, port = str(given["host"]), int(given["port"])
+        try:
+            socket.create_connection((host, port), timeout=2.0).close()
+        except OSError as error:
+            raise Unusable(f"no socketcand server at {host}:{port}: {error.strerror or error}") from error
     try:
         bus = create_bus_from_namespace(namespace)
     except argparse.ArgumentError as error:
         raise Unusable(f"can't open the bus: {error.__cause__ or error}") from error
     return bus, bus.channel_info
-
-
-def _configured() -> bool:
-    """Return whether python-can finds an interface in its files or in CAN_* variables."""
-    import can.util
-
-    try:
-        can.util.load_config()
-    except can.CanInterfaceNotImplementedError:
-        return False
-    return True
-
-
-def _probe(host: str, port: int) -> None:
-    """Check the server first: python-can would try for ten seconds, at full load, to reach a missing server."""
-    try:
-        socket.create_connection((host, port), timeout=2.0).close()
-    except OSError as error:
-        raise Unusable(f"no socketcand server at {host}:{port}: {error.strerror or error}") from error

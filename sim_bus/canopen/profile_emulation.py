@@ -5,7 +5,7 @@ from canopen.objectdictionary import datatypes
 from profiles.canopen import CanopenProfile
 from sim_bus.canopen.services import LifeGuard
 from sim_bus.object_drive import ObjectDrive
-from sim_bus.objects import ObjectStore, key_of
+from sim_bus.objects import key_of
 
 
 def apply_on_canopen(profile: CanopenProfile, drive: ObjectDrive, guard: LifeGuard) -> None:
@@ -23,12 +23,7 @@ def apply_on_canopen(profile: CanopenProfile, drive: ObjectDrive, guard: LifeGua
             store.add(index, 0, kind, writable=True, mappable=False, name=f"Guarding {index:04X}")
             store.set_default(index, 0, 0)
             store.hooks[key_of(index)] = hook
-    _unmap_what_is_gone(store)
-
-
-def _unmap_what_is_gone(store: ObjectStore) -> None:
-    """Empty the default mapping of a PDO that names a missing object."""
-    for area in (0x1600, 0x1A00):
+    for area in (0x1600, 0x1A00):            # a PDO that names a missing object maps nothing by default
         for mapping in range(area, area + 4):
             entries = [store.default(key_of(mapping, 1 + number)) for number in range(8)]
             if any(entry and entry >> 16 not in store.object_dictionary for entry in entries):

@@ -74,7 +74,9 @@ class Simulator:
                 try:
                     message = self._bus.recv(timeout_s)
                 except BUS_ERRORS as error:
-                    self._bus_ended(error, stop)
+                    self._time.run_on(f"bus lost ({error}): running on in own time", time.monotonic())
+                    stop.wait(_POLL_OWN_TIME_S if self._time.runs else _RETRY_S)
+                    self._time.follow(time.monotonic())
                     continue
                 if message is None:
                     self._nothing_came(timeout_s, before_s, stop)
@@ -129,11 +131,6 @@ class Simulator:
         # A process without processor time can't know whether other stations are silent: no wait counts for more than
         # its length.
         self._time.waited(min(waited_s, timeout_s), time.monotonic())
-
-    def _bus_ended(self, error: BaseException, stop: threading.Event) -> None:
-        self._time.run_on(f"bus lost ({error}): running on in own time", time.monotonic())
-        stop.wait(_POLL_OWN_TIME_S if self._time.runs else _RETRY_S)
-        self._time.follow(time.monotonic())
 
     def _on_send_failed(self, error: BaseException) -> None:
         self.node.note(f"sending failed: {error}")

@@ -59,17 +59,16 @@ def eeprom(identity: Sequence[int], alias: int, name: str, areas: Sequence[Area]
     content += _category(FMMUS, bytes((1, 2)))
     content += _category(SYNC_MANAGERS, b"".join(pack("<HHBBBB", *one[:3], 0, 1, one.kind) for one in areas))
     for kind, manager in ((INPUTS, 3), (OUTPUTS, 2)):
-        content += _category(kind, b"".join(_pdo(pdo) for pdo in pdos if pdo.manager == manager))
+        packed = b""
+        for pdo in pdos:
+            if pdo.manager == manager:
+                packed += pack("<HBBBBH", pdo.number, len(pdo.entries), manager, 0, 0, 0)
+                packed += b"".join(pack("<HBBBBH", one >> 16, one >> 8 & 0xFF, 0, data_type, one & 0xFF, 0)
+                                   for one, data_type in pdo.entries)
+        content += _category(kind, packed)
     return (content + pack("<HH", END, END)).ljust(SIZE, b"\xff")
 
 
 def _category(kind: int, content: bytes) -> bytes:
     content += b"\0" * (len(content) % 2)
     return pack("<HH", kind, len(content) // 2) + content
-
-
-def _pdo(pdo: SiiPdo) -> bytes:
-    entries = b"".join(
-        pack("<HBBBBH", one >> 16, one >> 8 & 0xFF, 0, data_type, one & 0xFF, 0) for one, data_type in pdo.entries
-    )
-    return pack("<HBBBBH", pdo.number, len(pdo.entries), pdo.manager, 0, 0, 0) + entries
