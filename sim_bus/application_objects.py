@@ -146,8 +146,9 @@ class ApplicationObjects:
 
     def __init__(self, store: ObjectStore, application: Application, units: ObjectUnits | None = None) -> None:
         self._application = application
-        self._units = units or standard_units(application.inverter.params.drive)
-        self._usual = standard_units(application.inverter.params.drive)
+        drive = application.inverter.params.drive
+        self._units = units or standard_units(drive)
+        self._usual = standard_units(drive)
         self._store = store
         self.setters: dict[int, Callable[[int], None]] = {
             key_of(0x6040): application.write_controlword,
@@ -157,25 +158,22 @@ class ApplicationObjects:
             key_of(0x60FF): self._set_target_velocity,
             key_of(0x6042): self._set_target_velocity,
         }
-        self._ratings()
-        self._bind_process_data()
-        self._bind_settings()
-        self._bind_limits()
-        self._add_speed_loop()
-
-    def _ratings(self) -> None:
-        """Set the defaults that depend on the rig. The drive's own limits are also the highest values that may be
-        written.
-        """
-        drive, store, units = self._application.inverter.params.drive, self._store, self._units
-        torque = min(65535, round(drive.torque_limit_nm / units.max_torque))
-        speed = max(1, round(drive.speed_limit_rpm * RPM / units.motor_speed))
+        # These defaults depend on the rig. The drive's own limits are also the highest values that may be written.
+        torque = min(65535, round(drive.torque_limit_nm / self._units.max_torque))
+        speed = max(1, round(drive.speed_limit_rpm * RPM / self._units.motor_speed))
         store.set_default(0x6075, 0, round(1000.0 * drive.rated_current_a))
-        store.set_default(0x6076, 0, rated_torque_counts(drive.rated_torque_nm, units.rated_torque))
+        store.set_default(0x6076, 0, rated_torque_counts(drive.rated_torque_nm, self._units.rated_torque))
         store.set_default(0x6072, 0, torque)
         store.set_default(0x6080, 0, speed)
         store.variable(0x6072, 0).max = torque
         store.variable(0x6080, 0).max = speed
+        self._bind_process_data()
+        self._bind_settings()
+        self._bind_limits()
+        gains = (drive.speed_gain_nm_s_rad, drive.speed_integral_gain_nm_rad, drive.speed_filter_s)
+        for sub, value in enumerate(gains, 1):       # for a host that reads the gains of the speed loop
+            store.add(SPEED_LOOP_INDEX, sub, datatypes.REAL32, writable=False, mappable=False,
+                      name=f"Speed loop {sub}", default=value)
 
     def _bind_process_data(self) -> None:
         application, store = self._application, self._store
@@ -239,14 +237,6 @@ class ApplicationObjects:
         for index in present:
             store.hooks[key_of(index)] = torque(index)
         store.hooks[key_of(0x6080)] = speed
-
-    def _add_speed_loop(self) -> None:
-        """Add the gains of the speed loop, for a host that reads them."""
-        drive = self._application.inverter.params.drive
-        gains = (drive.speed_gain_nm_s_rad, drive.speed_integral_gain_nm_rad, drive.speed_filter_s)
-        for sub, value in enumerate(gains, 1):
-            self._store.add(SPEED_LOOP_INDEX, sub, datatypes.REAL32, writable=False, mappable=False,
-                            name=f"Speed loop {sub}", default=value)
 
     def _setting(self, index: int, name: str, allowed: set[int]) -> None:
         settings: ApplicationSettings = self._application.settings

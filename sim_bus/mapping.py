@@ -8,6 +8,7 @@ The order of writing is that of CiA 301: count 0, entries, count. Every other or
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from struct import Struct
 
 from canopen.sdo import SdoAbortedError
@@ -77,7 +78,10 @@ class MappedData:
         ]
         self._struct = Struct("<" + "".join(formats))
         self._getters = [store.getter(key) for key in keys]
-        self._setters = [self._setter(key, setters or {}) for key in keys]
+        given = setters or {}
+        self._setters = [
+            _discard if key >> 8 <= LAST_DUMMY else given.get(key) or partial(self._write, key) for key in keys
+        ]
 
     @property
     def size(self) -> int:
@@ -92,11 +96,6 @@ class MappedData:
         """Write the values into their objects."""
         for setter, value in zip(self._setters, self._struct.unpack_from(data), strict=True):
             setter(value)
-
-    def _setter(self, key: int, setters: Mapping[int, Setter]) -> Setter:
-        if key >> 8 <= LAST_DUMMY:
-            return _discard
-        return setters.get(key) or (lambda value: self._write(key, value))
 
     def _write(self, key: int, value: int) -> None:
         """Write a value. A value out of range is dropped, because cyclic data cannot be refused."""

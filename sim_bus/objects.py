@@ -161,7 +161,12 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         if 8 * len(data) != len(variable):
             raise SdoAbortedError(ABORT_LENGTH)
         if variable.data_type in objectdictionary.FLOAT_TYPES:
-            self._write_float(key_of(index, subindex), float(variable.decode_raw(bytes(data))))
+            number, key = float(variable.decode_raw(bytes(data))), key_of(index, subindex)
+            if not isfinite(number):         # NaN and the infinities are out of every range
+                raise SdoAbortedError(ABORT_VALUE)
+            if key in self.float_hooks:
+                self.float_hooks[key](number)
+            self.values[key] = number
             return
         if variable.data_type not in objectdictionary.INTEGER_TYPES:
             raise SdoAbortedError(ABORT_LENGTH)
@@ -169,15 +174,6 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         if not isinstance(value, int):
             raise SdoAbortedError(ABORT_LENGTH)
         self.write(key_of(index, subindex), value)
-
-    def _write_float(self, key: int, value: float) -> None:
-        """Write a REAL32. NaN and the infinities are out of every range."""
-        if not isfinite(value):
-            raise SdoAbortedError(ABORT_VALUE)
-        hook = self.float_hooks.get(key)
-        if hook is not None:
-            hook(value)
-        self.values[key] = value
 
     def add(self, index: int, subindex: int, data_type: int, *, writable: bool, mappable: bool, name: str,
             default: Value | None = None) -> None:

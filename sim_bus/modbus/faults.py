@@ -164,19 +164,15 @@ class FrozenReads(Misbehaviour):
 
     def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
         reply = ask(pdu)
-        if reply.pdu is None or reply.pdu[0] != pdu[0] or not self._is_feedback(pdu):
+        if reply.pdu is None or reply.pdu[0] != pdu[0]:
             return reply
-        return reply._replace(pdu=self._kept.setdefault(pdu[:5], reply.pdu))
-
-    def _is_feedback(self, pdu: bytes) -> bool:
-        """Return whether the request reads speed or torque."""
         table = _TABLES.get(pdu[0])
         first, count = int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")
         cycle = self.scene.profile.cycle
-        return any(
-            signal.register_.table == table and first <= signal.register_.address < first + count
-            for signal in (cycle.speed, cycle.torque)
-        )
+        if not any(signal.register_.table == table and first <= signal.register_.address < first + count
+                   for signal in (cycle.speed, cycle.torque)):
+            return reply
+        return reply._replace(pdu=self._kept.setdefault(pdu[:5], reply.pdu))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -216,7 +216,12 @@ class TcpListener:
             for request in tcp_requests(buffer):
                 reply = serve(request._replace(connection=number))
                 if reply.connection:
-                    self._end_connection(source, reset=reply.connection == "reset")
+                    self._clients.pop(source)
+                    if reply.connection == "reset":
+                        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+                        client.close()
+                    else:                                  # the connection ends without any message
+                        self._silent.append(client)
                     return
                 if reply.pdu is not None and not reply.crc_bits:
                     frame = tcp_reply(request, reply.pdu, reply.transaction_bits)
@@ -238,15 +243,6 @@ class TcpListener:
         self._silent.clear()
         self._clients.clear()
         self._server.close()
-
-    def _end_connection(self, source: int, *, reset: bool) -> None:
-        """End a connection by a reset, or without any message."""
-        client, _, _ = self._clients.pop(source)
-        if reset:
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
-            client.close()
-        else:
-            self._silent.append(client)
 
     def _accept(self) -> None:
         with suppress(OSError):

@@ -13,7 +13,7 @@ A read takes all registers at one moment. A write checks everything before anyth
 """
 
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -76,14 +76,17 @@ class Map:
         self.temperature_c = 40.0      # of all parts that report a temperature
         self._speed_counts = 0
         self._torque_counts = 0
-        named = self._cycle() + self._mode() + self._echoes() + self._position() + self._families() + self._settings()
-        named += self._temperatures()
+        named = self._cycle() + self._mode() + self._echoes() + self._position()
+        named += [Slot(RegisterLayout(address), extra.read, extra.write) for address, extra in words.extras().items()]
+        named += self._settings() + self._temperatures()
         self.slots: dict[tuple[str, int], Slot] = {}
         for slot in named:
             self._lay(replace(slot, layout=self._moved(slot.layout)))
         self._fill_gaps(profile.cycle.largest_gap)
-        for slot in _marker(stepped):
-            self._lay(slot)
+        text = MARKER_TEXT.encode("ascii").ljust(2 * MARKER_REGISTERS, b"\0")
+        marker = [int.from_bytes(text[at : at + 2], "big") for at in range(0, len(text), 2)]
+        for number, word in enumerate([*marker, int(stepped)]):
+            self._lay(Slot(RegisterLayout(MARKER_REGISTER + number), lambda word=word: word))  # type: ignore[misc]
         self._stage = 0
         self._on_stage = on_stage
         self._lay(Slot(RegisterLayout(MARKER_STAGE_REGISTER), lambda: self._stage, self._set_stage))
@@ -180,10 +183,6 @@ class Map:
     def _is_hot(self) -> bool:
         return self.temperature_c > HOT_C
 
-    def _families(self) -> list[Slot]:
-        return [Slot(RegisterLayout(address), extra.read, extra.write) for address,
-                extra in self._words.extras().items()]
-
     def _settings(self) -> list[Slot]:
         """Return the slots of the parameters. Those that preflight or the operator sets may be written."""
         parameters, slots = self._parameters, list[Slot]()
@@ -279,13 +278,6 @@ class Map:
                 if high - low - 1 <= largest:
                     for address in range(low + 1, high):
                         self._lay(Slot(RegisterLayout(address, table=table), lambda: 0))
-
-
-def _marker(stepped: bool) -> Iterable[Slot]:
-    text = MARKER_TEXT.encode("ascii").ljust(2 * MARKER_REGISTERS, b"\0")
-    words = [int.from_bytes(text[at : at + 2], "big") for at in range(0, len(text), 2)]
-    for number, word in enumerate([*words, int(stepped)]):
-        yield Slot(RegisterLayout(MARKER_REGISTER + number), lambda word=word: word)  # type: ignore[misc]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
