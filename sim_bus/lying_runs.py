@@ -382,21 +382,21 @@ def unknowable(combination: Combination) -> Unknowable | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _makes_sense(program: CommandLine, told: LieWithValue, moment: str) -> bool:
-    """Return whether the drive reports that signal and the run has that moment."""
-    if told.name not in LIES and told.name != "frozen-feedback":
-        raise ValueError(f"no lie is called {told.name}")
-    reported = {"position": program.position, "demand": program.demand}
-    return reported.get(told.name.split("-", maxsplit=1)[0], True) and (
-        moment.split("+", maxsplit=1)[0] not in program.skipped)
-
-
 @cache
 def product() -> tuple[Combination, ...]:
     """Return every combination, numbered."""
-    every = ((program, told, moment) for told in TOLD for moment in MOMENTS for program in PROGRAMS.values()
-             if _makes_sense(program, told, moment))
-    return tuple(Combination(number, *one) for number, one in enumerate(every))
+    found: list[Combination] = []
+    for told in TOLD:
+        if told.name not in LIES and told.name != "frozen-feedback":
+            raise ValueError(f"no lie is called {told.name}")
+        signal = told.name.split("-", maxsplit=1)[0]
+        for moment in MOMENTS:
+            for program in PROGRAMS.values():
+                # The drive must report that signal, and the run must have that moment.
+                reported = {"position": program.position, "demand": program.demand}.get(signal, True)
+                if reported and moment.split("+", maxsplit=1)[0] not in program.skipped:
+                    found.append(Combination(len(found), program, told, moment))
+    return tuple(found)
 
 
 def standard() -> Iterator[Combination]:

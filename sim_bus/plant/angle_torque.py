@@ -50,13 +50,9 @@ class AngleTorque(Generic[S]):
     """Another plant, by its rest and its step, with the torque of ``harmonics`` at its motor end."""
 
     def __init__(self, rest: Callable[[], S], step: Callable[..., S], harmonics: tuple[Harmonic, ...]) -> None:
+        def step_on(state: S, torque_nm: float, dt_s: float, load_nm: float = 0.0, *bottom_nm: float) -> S:
+            against = torque_over_step(harmonics, state.angle_rad, state.speed_rad_s * dt_s)
+            return step(state, torque_nm, dt_s, load_nm + against, *bottom_nm)
+
         self.rest = rest
-        self.step = _with_harmonics(step, harmonics)
-
-
-def _with_harmonics(move: Callable[..., S], harmonics: tuple[Harmonic, ...]) -> Callable[..., S]:
-    def step_on(state: S, torque_nm: float, dt_s: float, load_nm: float = 0.0, *bottom_nm: float) -> S:
-        against = torque_over_step(harmonics, state.angle_rad, state.speed_rad_s * dt_s)
-        return move(state, torque_nm, dt_s, load_nm + against, *bottom_nm)
-
-    return step_on
+        self.step = step_on

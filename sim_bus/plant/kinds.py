@@ -100,10 +100,15 @@ def build(params: Any) -> Plant[Any]:
     return AngleTorque(plant.rest, plant.step, harmonics) if harmonics else plant
 
 
-def _rigid_unless_said(section: Any) -> Any:
-    """Add ``kind`` if it is missing. A kind that does not exist, or a key of another kind, is refused by name."""
-    if not isinstance(section, dict):
+def _read(section: Any) -> Any:
+    """Return the section as the model of its kind, rigid if it states none. Raises the errors of that model.
+
+    A kind that does not exist, or a key of another kind, is refused by name.
+    """
+    if isinstance(section, tuple(kind.params for kind in PLANTS.values())):
         return section
+    if not isinstance(section, dict):
+        return PLANTS["rigid"].params.model_validate(section)
     kind = section.get("kind", "rigid")
     if not isinstance(kind, str) or kind not in PLANTS:
         *first, last = PLANTS
@@ -115,16 +120,7 @@ def _rigid_unless_said(section: Any) -> Any:
     }
     refuse_if([(key, f"belongs to kind: {' or '.join(kinds)}, and this plant is {kind}")
                for key, kinds in foreign.items() if kinds])
-    return {"kind": kind, **section}
-
-
-def _read(section: Any) -> Any:
-    """Return the section as the model of its kind. Raises the errors of that model."""
-    if isinstance(section, tuple(kind.params for kind in PLANTS.values())):
-        return section
-    section = _rigid_unless_said(section)
-    name = section["kind"] if isinstance(section, dict) else "rigid"
-    return PLANTS[name].params.model_validate(section)
+    return PLANTS[kind].params.model_validate({"kind": kind, **section})
 
 
 if TYPE_CHECKING:

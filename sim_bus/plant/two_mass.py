@@ -92,15 +92,29 @@ def step(params: TwoMassParams, state: TwoMassState, torque_nm: float, dt_s: flo
 
 def stepper(params: TwoMassParams) -> Callable[..., TwoMassState]:
     """Return `step` for one shaft. Constants that follow from its parameters are computed once."""
-    mobility, constant_nm, below_nm = params.mobility_1_kg_m2, params.load_nm, params.bottom.load_nm
-    fastest = max(sqrt(params.stiffness_nm_rad * mobility), params.damping_nm_s_rad * mobility)
-    piece = _piece_of(params)
+    bottom, stiffness, damping = params.bottom, params.stiffness_nm_rad, params.damping_nm_s_rad
+    mobility, constant_nm, bottom_nm = params.mobility_1_kg_m2, params.load_nm, bottom.load_nm
+    fastest = max(sqrt(stiffness * mobility), damping * mobility)
+    move, low_move = advance_of(params), advance_of(bottom)
+
+    def piece(state: TwoMassState, drive: float, below_nm: float, dt_s: float) -> TwoMassState:
+        speed, angle, bristle, low_speed, low_angle, low_bristle = state
+        difference = speed - low_speed
+        spring = stiffness * _beyond_play(params, angle - low_angle + 0.5 * dt_s * difference)
+        torque = _pushed(params, spring, damping * difference)
+        end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
+        low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
+        if damping > 0.0:
+            torque = _pushed(params, spring, 0.5 * damping * (difference + end - low_end))
+            end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
+            low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
+        return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)
 
     def step_on(
         state: TwoMassState, torque_nm: float, dt_s: float, load_nm: float = 0.0, bottom_load_nm: float = 0.0
     ) -> TwoMassState:
         count = 1 + int(fastest * dt_s / _CUT)
-        drive, against_bottom = torque_nm - load_nm - constant_nm, below_nm + bottom_load_nm
+        drive, against_bottom = torque_nm - load_nm - constant_nm, bottom_nm + bottom_load_nm
         for _ in range(count):
             state = piece(state, drive, against_bottom, dt_s / count)
         return state
@@ -126,23 +140,3 @@ def _pushed(params: TwoMassParams, spring_nm: float, damped_nm: float) -> float:
     if not params.play_rad:
         return spring_nm + damped_nm
     return max(spring_nm + damped_nm, 0.0) if spring_nm > 0.0 else min(spring_nm + damped_nm, 0.0) if spring_nm else 0.0
-
-
-def _piece_of(params: TwoMassParams) -> Callable[[TwoMassState, float, float, float], TwoMassState]:
-    bottom, stiffness, damping = params.bottom, params.stiffness_nm_rad, params.damping_nm_s_rad
-    move, low_move = advance_of(params), advance_of(bottom)
-
-    def piece(state: TwoMassState, drive: float, below_nm: float, dt_s: float) -> TwoMassState:
-        speed, angle, bristle, low_speed, low_angle, low_bristle = state
-        difference = speed - low_speed
-        spring = stiffness * _beyond_play(params, angle - low_angle + 0.5 * dt_s * difference)
-        torque = _pushed(params, spring, damping * difference)
-        end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
-        low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
-        if damping > 0.0:
-            torque = _pushed(params, spring, 0.5 * damping * (difference + end - low_end))
-            end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
-            low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
-        return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)
-
-    return piece

@@ -39,9 +39,15 @@ _SHORT = 1e-3
 def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """Return (speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
     count = _pieces(shaft, dt_s)
-    travel = 0.0
+    piece_s, travel = dt_s / count, 0.0
     for _ in range(count):
-        speed, bristle, more = _through_zero(shaft, speed, bristle, drive, dt_s / count)
+        end, bristle_end, more = _piece(shaft, speed, bristle, drive, piece_s)
+        if speed * end < 0.0:
+            crossing = piece_s * speed / (speed - end)
+            _, bristle_zero, before = _piece(shaft, speed, bristle, drive, crossing)
+            end, bristle_end, after = _piece(shaft, 0.0, bristle_zero, drive, piece_s - crossing)
+            more = before + after
+        speed, bristle = end, bristle_end
         travel += more
     return speed, bristle, travel
 
@@ -62,18 +68,6 @@ def _pieces(shaft: ShaftParams, dt_s: float) -> int:
     by_damping = stiffness / (_CONTRACTION * damping) if damping > 0.0 else by_inertia
     falling = 0.86 * (shaft.static_nm - shaft.coulomb_nm) / (shaft.stribeck_speed_rad_s * inertia * _STEEP)
     return max(1, min(_MOST_PIECES, ceil(dt_s * max(min(by_inertia, by_damping), falling))))
-
-
-def _through_zero(
-    shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float
-) -> tuple[float, float, float]:
-    end, bristle_end, travel = _piece(shaft, speed, bristle, drive, dt_s)
-    if speed * end >= 0.0:
-        return end, bristle_end, travel
-    crossing = dt_s * speed / (speed - end)
-    _, bristle_zero, travel = _piece(shaft, speed, bristle, drive, crossing)
-    end, bristle_end, more = _piece(shaft, 0.0, bristle_zero, drive, dt_s - crossing)
-    return end, bristle_end, travel + more
 
 
 def _piece(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
