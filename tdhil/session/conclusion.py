@@ -118,10 +118,15 @@ def conclude(
     recording = applied.recording
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     identification = _dated(identification, applied.day)
+    # A run whose stop was not confirmed has no result of its own; its replay has one.
+    stop = run.get("stop")
+    unseen = isinstance(stop, Mapping) and stop.get("confirmed") is False
+    stop_said = "the stop of this run was NOT confirmed: standstill was not observed at its end"
     said = (
         *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),
         *(CodedText(one, MessageCode.CALIBRATION_WARNING) for one in applied.warnings),
-        *_stop_warnings(run), *precondition_warnings(run), *speed_warnings(run), *stage_warnings(run),
+        *([CodedText(stop_said, MessageCode.STOP_WAS_NOT_CONFIRMED)] if unseen else ()),
+        *precondition_warnings(run), *speed_warnings(run), *stage_warnings(run),
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
@@ -153,11 +158,3 @@ def _dated(found: Identification, day: str) -> Identification:
     return replace(found, advice=advice, calibration_advised=False, budget=tuple(
         replace(line, source=f"{TORQUE_SCALE}, calibrated {day}") if line.source == TORQUE_SCALE else line
         for line in found.budget))
-
-
-def _stop_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a warning if the stop was not confirmed. Such a run has no result of its own; its replay has one."""
-    stop = run.get("stop")
-    unseen = isinstance(stop, Mapping) and stop.get("confirmed") is False
-    said = "the stop of this run was NOT confirmed: standstill was not observed at its end"
-    return (CodedText(said, MessageCode.STOP_WAS_NOT_CONFIRMED),) if unseen else ()

@@ -37,24 +37,18 @@ def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) 
             )
     profile = load_profile(options.profile, bus.name)
     found = Connection(bus, profile, bus.line(cli, rig, profile))
-    _refuse_another_bus(found, rig, options)
-    return options, found
-
-
-def _refuse_another_bus(found: Connection, rig: Rig | None, options: RunOptions) -> None:
-    """Raise DataFileError if rig.yaml gives a drive's address on another bus: the simulator was not meant."""
     if rig is None or found.configured or options.simulate:
-        return
-    bus = found.bus
-    other = next((one for one in all_buses() if one.name != bus.name and one.placed_in(rig)), None)
-    if other is None:
-        return
-    missing = f"{bus.section}: ({bus.place_keys})" if bus.section else bus.named_by
-    raise DataFileError((Problem(
-        rig.file or "rig.yaml", rig.line(other.section),
-        f"{other.section}: gives a drive's address, but the drive is on {bus.name} ({options.source('drive')}), and"
-        f" its address is missing; give {missing}, name the other drive, or use the simulated one with --simulate",
-    ),), entry=MessageCode.OPTION_OF_ANOTHER_BUS)
+        return options, found
+    addressed = next((one for one in all_buses() if one.name != bus.name and one.placed_in(rig)), None)
+    if addressed is not None:              # rig.yaml gives an address on another bus: the simulator was not meant
+        missing = f"{bus.section}: ({bus.place_keys})" if bus.section else bus.named_by
+        raise DataFileError((Problem(
+            rig.file or "rig.yaml", rig.line(addressed.section),
+            f"{addressed.section}: gives a drive's address, but the drive is on {bus.name} ({options.source('drive')}),"
+            f" and its address is missing; give {missing}, name the other drive,"
+            " or use the simulated one with --simulate",
+        ),), entry=MessageCode.OPTION_OF_ANOTHER_BUS)
+    return options, found
 
 
 def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> RunOptions:

@@ -59,8 +59,10 @@ class LogPlace:
         """
         if self._descriptor is None or self._is_there(self.path):
             return
-        missing, found = self.path, self._real_path()
-        if found is not None:
+        missing, found = self.path, None
+        with suppress(OSError):
+            found = Path(f"/proc/self/fd/{self._descriptor}").readlink()
+        if found is not None and self._is_there(found):
             self.path, self.moved = found, f"{missing} was moved during the run: the log is now {found}"
             return
         for folder in (partial(Path, missing.parent), Path.cwd, tempfile.gettempdir):
@@ -82,13 +84,6 @@ class LogPlace:
             return self._descriptor is None or os.path.samestat(path.stat(), os.fstat(self._descriptor))
         except OSError:
             return False
-
-    def _real_path(self) -> Path | None:
-        try:
-            found = Path(f"/proc/self/fd/{self._descriptor}").readlink()
-        except OSError:
-            return None
-        return found if self._is_there(found) else None
 
     def _forget(self) -> None:
         if self._descriptor is not None:

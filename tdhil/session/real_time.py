@@ -81,7 +81,13 @@ def _raise_thread() -> str:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as error:
         return f"{error.strerror or error}"
-    _lower_where_it_runs_away()
+    # The kernel sends SIGXCPU to a real-time thread that computes for this time without a pause.
+    with suppress(OSError, ValueError, AttributeError, ImportError):   # no main thread, or no such limit
+        import resource
+
+        signal.signal(signal.SIGXCPU, lambda *_: _lower_thread())
+        hard = resource.getrlimit(resource.RLIMIT_RTTIME)[1]
+        resource.setrlimit(resource.RLIMIT_RTTIME, (round(MOST_CPU_S * 1e6), hard))
     return ""
 
 
@@ -93,16 +99,6 @@ def _lower_thread() -> None:
 
         unlimited = resource.getrlimit(resource.RLIMIT_RTTIME)[1]
         resource.setrlimit(resource.RLIMIT_RTTIME, (unlimited, unlimited))
-
-
-def _lower_where_it_runs_away() -> None:
-    """Set RLIMIT_RTTIME: the kernel sends SIGXCPU to a real-time thread that computes for this time without a pause."""
-    with suppress(OSError, ValueError, AttributeError, ImportError):   # no main thread, or no such limit
-        import resource
-
-        signal.signal(signal.SIGXCPU, lambda *_: _lower_thread())
-        hard = resource.getrlimit(resource.RLIMIT_RTTIME)[1]
-        resource.setrlimit(resource.RLIMIT_RTTIME, (round(MOST_CPU_S * 1e6), hard))
 
 
 def _lock_memory() -> str:
@@ -126,17 +122,14 @@ def _memory_limit() -> str:
         soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     except (ImportError, AttributeError, OSError):
         return "this system does not support it"
-    if soft == resource.RLIM_INFINITY or _may_lock():
+    if soft == resource.RLIM_INFINITY:
         return ""
-    return f"at most {soft / 1e6:.3g} MB may be locked"
-
-
-def _may_lock() -> bool:
     with suppress(OSError, ValueError, IndexError):
         status = Path("/proc/self/status").read_text(encoding="ascii")
         effective = int(status.split("CapEff:")[1].split()[0], 16)
-        return bool(effective >> _CAP_IPC_LOCK & 1)
-    return False
+        if effective >> _CAP_IPC_LOCK & 1:
+            return ""
+    return f"at most {soft / 1e6:.3g} MB may be locked"
 
 
 def _libc() -> ctypes.CDLL:

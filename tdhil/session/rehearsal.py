@@ -213,8 +213,14 @@ def judge_rehearsal(
     kinds = {one.name: one for one in bus_named(drive).faults()}
     code = _code(outcome) if own_code is None else own_code
     by_hand = code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED)
-    truth = None if any(one.name == "load-lost" for one in peer.faults) else _true_inertia(peer)
-    covered = _covered(document, truth)
+    truth = None               # of a rigid shaft, kg·m²; of any other plant, J is only a part
+    plant = None if peer.plant is None else peer.plant.plant
+    if plant is not None and plant.kind == "rigid" and not any(one.name == "load-lost" for one in peer.faults):
+        truth = float(plant.inertia_kg_m2 + plant.added_inertia_kg_m2)
+    inertia = None if document is None else document.get("inertia_kg_m2")
+    covered = None
+    if inertia is not None and truth is not None:
+        covered = bool(inertia["low_total"] <= truth <= inertia["high_total"])
     triggered = [one for one in peer.faults if one.text not in peer.never_came]
     required = [REQUIRED.get(_row(one, kinds), ANY_FAULT) for one in triggered]
     allowed = {known for one in required for known in one.codes} | (set(OTHER_PROGRAMS) if other_program else set())
@@ -240,21 +246,6 @@ def _code(outcome: RunOutcome) -> int:
     if outcome.stop is not None and not outcome.stop.confirmed:
         return int(ExitCode.STOP_NOT_CONFIRMED)
     return int(ExitCode.OK if outcome.cause is None else exit_code(outcome.cause))
-
-
-def _true_inertia(peer: PeerPlan) -> float | None:
-    """Return the inertia of a simulated rigid shaft, kg·m²; None for any other plant, of which J is only a part."""
-    plant = None if peer.plant is None else peer.plant.plant
-    if plant is None or plant.kind != "rigid":
-        return None
-    return float(plant.inertia_kg_m2 + plant.added_inertia_kg_m2)
-
-
-def _covered(document: Mapping[str, Any] | None, truth: float | None) -> bool | None:
-    inertia = None if document is None else document.get("inertia_kg_m2")
-    if inertia is None or truth is None:
-        return None
-    return bool(inertia["low_total"] <= truth <= inertia["high_total"])
 
 
 def _seen(

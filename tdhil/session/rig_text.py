@@ -127,15 +127,12 @@ def _place(profile: Profile, known: RigEntries) -> tuple[str, ...]:
     what = "# The drive's address. Without it the embedded simulator runs."
     if not known.address:
         return (what, *bus_named(profile.bus).rig_blank(profile))
-    section = {key: value for key, value in known.address.items() if key in _section_fields(profile.bus)}
+    model = bus_named(profile.bus).section_model
+    fields = () if model is None else model.model_fields
+    section = {key: value for key, value in known.address.items() if key in fields}
     beside = {key: value for key, value in known.address.items() if key not in section}
     return (what, *((_section(profile.bus, section, _typed),) if section else ()),
             *(f"{key}: {_typed(value)}" for key, value in beside.items()))
-
-
-def _section_fields(bus: str) -> frozenset[str]:
-    model = bus_named(bus).section_model
-    return frozenset(model.model_fields) if model is not None else frozenset()
 
 
 def to_fill_in(profile: Profile, load: str, name: str | None = None) -> list[str]:

@@ -170,9 +170,25 @@ def read(
                 raise UsageError("is for a trace in CSV; this log contains its own", where=name,
                                  entry=MessageCode.OPTION_FOR_CSV_ONLY)
         return _read_log(path)
-    return _read_trace(
-        path, columns, excitation, rated_torque_nm, torque_limit_nm, gear_ratio, torque_scale_rel_sd, lags, skew_sd_s
+    from tdhil.config import ASKED_AGAIN
+    from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
+    from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD
+
+    scale = torque_scale_rel_sd
+    bench = Bench(
+        rated_torque_nm=rated_torque_nm,
+        torque_limit_nm=torque_limit_nm,
+        torque_scale_rel_sd=ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
+        gear_ratio=1.0 if gear_ratio is None else gear_ratio,
+        lag_prior=LagPrior() if lags is None else lags,
+        skew_sd_s=skew_sd_s,
     )
+    choices = USUAL if columns is None else parse_columns(list(columns))
+    motion = Path(excitation) if isinstance(excitation, str) else excitation
+    recording, assumed = read_recording(path, choices, motion, bench)
+    if scale is None:
+        assumed = (*assumed, f"standard uncertainty of the torque scale, assumed: {ASSUMED_TORQUE_SCALE_REL_SD:.0%}")
+    return RunRecord(recording, {"identify": {one.name: one.default for one in ASKED_AGAIN}}, str(path), assumed)
 
 
 def trace_arguments(given: Mapping[str, Any], source: str) -> dict[str, Any]:
@@ -242,15 +258,12 @@ def _read_log(path: Path) -> RunRecord:
     if "started" not in configuration and found.epoch_ns:      # a log from before 0.2, of a run in real time
         began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
         configuration["started"] = began.isoformat(timespec="seconds")
-    return RunRecord(found.recording, configuration, str(path), _assumed_in(configuration), found.problems, ended,
-                     found.result, found.virtual_string)
-
-
-def _assumed_in(configuration: Mapping[str, Any]) -> tuple[str, ...] | None:
-    """Return the assumptions in a log that was made from a trace; None for the log of a run. A log is not trusted."""
+    # The assumptions in a log that was made from a trace; the log of a run has none. A log is not trusted.
     trace = configuration.get("trace")
-    found = trace.get("assumed") if isinstance(trace, Mapping) else None
-    return tuple(str(one)[:500] for one in found[:100]) if isinstance(found, list) else None
+    listed = trace.get("assumed") if isinstance(trace, Mapping) else None
+    assumed = tuple(str(one)[:500] for one in listed[:100]) if isinstance(listed, list) else None
+    return RunRecord(found.recording, configuration, str(path), assumed, found.problems, ended, found.result,
+                     found.virtual_string)
 
 
 def write_as_log(record: RunRecord, path: Path, run: Mapping[str, Any]) -> None:
@@ -262,31 +275,6 @@ def write_as_log(record: RunRecord, path: Path, run: Mapping[str, Any]) -> None:
 
     trace = {**run.get("trace", {}), "assumed": list(record.assumed or ())}
     write_trace_log(path, record.recording, {**record.configuration, **run, "trace": trace})
-
-
-def _read_trace(
-    path: Path, columns: Sequence[str] | None, excitation: str | Path | Mapping[str, Any] | None,
-    rated_torque_nm: float | None, torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None,
-    lags: LagPrior | None, skew_sd_s: float | None,
-) -> RunRecord:
-    from tdhil.config import ASKED_AGAIN
-    from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
-    from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD
-
-    bench = Bench(
-        rated_torque_nm=rated_torque_nm,
-        torque_limit_nm=torque_limit_nm,
-        torque_scale_rel_sd=ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
-        gear_ratio=1.0 if gear_ratio is None else gear_ratio,
-        lag_prior=LagPrior() if lags is None else lags,
-        skew_sd_s=skew_sd_s,
-    )
-    choices = USUAL if columns is None else parse_columns(list(columns))
-    motion = Path(excitation) if isinstance(excitation, str) else excitation
-    recording, assumed = read_recording(path, choices, motion, bench)
-    if scale is None:
-        assumed = (*assumed, f"standard uncertainty of the torque scale, assumed: {ASSUMED_TORQUE_SCALE_REL_SD:.0%}")
-    return RunRecord(recording, {"identify": {one.name: one.default for one in ASKED_AGAIN}}, str(path), assumed)
 
 
 def _extra(name: str) -> Any:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from tdhil.buses import Connection, PeerPlan
 from tdhil.config import Expectation, Overrides, Rig, RunOptions, expectations_of, require_name
 from tdhil.errors import ExitCode, LogError, TdhilError
-from tdhil.recording import FRAME_CHANNELS, Recording, RunLog, RunWriter
+from tdhil.recording import FRAME_CHANNELS, RunLog, RunWriter
 from tdhil.runner import (
     Display,
     ExcitationRequest,
@@ -196,8 +196,10 @@ class RunSession:
 
         recording = self.log.recording(complete=True)
         found = conclude_run(recording, self.log.run, str(self.path), self.log.virtual_string)
-        if isinstance(found, Conclusion):
-            self._tell_last(found, recording)
+        if isinstance(found, Conclusion) and recording.excitation is not None:
+            confidence = float(self.log.run["identify"]["confidence"])
+            with suppress(LogError):           # J of the result is the last one of the run
+                self.log.inertia(live_inertia(found.identification, recording, confidence))
         self._judge(found.document, int(found.exit_code))
         if self.rehearsal is not None:
             from tdhil.report import rehearsal_of
@@ -208,13 +210,6 @@ class RunSession:
         with suppress(LogError):  # a log failure must not lose the result; `close` reports it
             self.log.result(found.document)
         return found
-
-    def _tell_last(self, found: Conclusion, recording: Recording) -> None:
-        """Write J of the result as the last one of the run."""
-        if recording.excitation is not None:
-            confidence = float(self.log.run["identify"]["confidence"])
-            with suppress(LogError):
-                self.log.inertia(live_inertia(found.identification, recording, confidence))
 
     def _judge(self, document: Mapping[str, Any] | None = None, code: int | None = None) -> None:
         """Judge the rehearsed faults, if any, and write the verdict to the log."""

@@ -69,8 +69,7 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
     """
     from tdhil.calibration import BodyRun, CalibrationCase, calibrate_torque
 
-    _require_different(runs)
-    _require_one_drive(runs)
+    _require_comparable(runs)
     ratio = runs[0].record.recording.gear_ratio
     square = ratio**2 if at == "main" else 1.0
     identified = []
@@ -78,7 +77,12 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
         run.record.require_motion()
         identified.append(conclude(run.record.recording, without_calibration(run.record.configuration), run.record.log)
                           .identification)
-    warnings = list(_not_stated(runs))
+    warnings = []
+    if any(run.added_kg_m2 and run.added_sd_kg_m2 is None for run in runs):
+        warnings.append("state the standard uncertainty of the body: it is not given, and"
+                        f" {ASSUMED_BODY_REL_SD:.1%} of its inertia is assumed")
+    if any(not drive_identity(run.record.configuration) for run in runs):
+        warnings.append("a trace does not name its drive: whether all are of the same drive was not checked")
     refusal = _refusal(runs, identified)
     if refusal is not None:
         return CalibrationFound(refusal, tuple(runs), tuple(identified), at, confidence, False, tuple(warnings))
@@ -143,7 +147,8 @@ def _sd(run: CalibrationRun) -> float:
     return ASSUMED_BODY_REL_SD * run.added_kg_m2 if run.added_sd_kg_m2 is None else run.added_sd_kg_m2
 
 
-def _require_different(runs: Sequence[CalibrationRun]) -> None:
+def _require_comparable(runs: Sequence[CalibrationRun]) -> None:
+    """Raise UsageError unless these are different recordings of one drive, with different bodies."""
     if len(runs) < 2:
         raise UsageError("one log is not enough: one without the body and one with it are needed",
                          next_step="tdhil calibrate torque without.mcap with.mcap --added 55")
@@ -156,9 +161,6 @@ def _require_different(runs: Sequence[CalibrationRun]) -> None:
             raise UsageError(f"is the same recording as {seen[digest]}", where=run.record.log,
                              next_step="Name the log of each run once")
         seen[digest] = run.record.log
-
-
-def _require_one_drive(runs: Sequence[CalibrationRun]) -> None:
     first = runs[0].record
     for run in runs[1:]:
         for what, of in (("drive", drive_identity), ("settings", drive_settings)):
@@ -179,16 +181,6 @@ def _differ(a: Any, b: Any) -> bool:
     if isinstance(a, int | float) and isinstance(b, int | float):
         return abs(a - b) > SETTINGS_ALIKE * max(abs(a), abs(b))
     return bool(a != b) and a is not None and b is not None
-
-
-def _not_stated(runs: Sequence[CalibrationRun]) -> Sequence[str]:
-    found = []
-    if any(run.added_kg_m2 and run.added_sd_kg_m2 is None for run in runs):
-        found.append("state the standard uncertainty of the body: it is not given, and"
-                     f" {ASSUMED_BODY_REL_SD:.1%} of its inertia is assumed")
-    if any(not drive_identity(run.record.configuration) for run in runs):
-        found.append("a trace does not name its drive: whether all are of the same drive was not checked")
-    return found
 
 
 def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification]) -> TorqueCalibration | None:

@@ -35,7 +35,6 @@ EXCEPTIONS = {
     "tdhil/runner/stages/braking_probe.py: probe_braking": 9,
     "tdhil/runner/stages/impedance.py: _planned": 10,
     "tdhil/service/server.py: serve": 11,
-    "tdhil/session/run_record.py: _read_trace": 9,
     "tdhil/session/run_record.py: read": 9,
     "tdhil/session/run_session.py: of": 9,
     "tdhil/soft_torque/evaluation.py: _verdict": 9,
