@@ -174,7 +174,12 @@ class Access:
         self._say, self._clock, self.changed = say, clock, changed
         self._lock = threading.Lock()
         self._writing = threading.Lock()
-        self._sessions: dict[str, Session] = _sessions_of(self._path)
+        self._sessions: dict[str, Session] = {}
+        for name, one in (read_json(self._path) or {}).items():
+            with suppress(TypeError, ValueError):
+                kept = Session(**one)
+                if isinstance(kept.user, str) and isinstance(kept.since, str):
+                    self._sessions[name] = Session(kept.user, kept.since, float(kept.begun_s), float(kept.ends_s))
         self._trouble = ""
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -370,16 +375,6 @@ def _named(name: str, connection: HTTPConnection) -> str:
 
 def _hash(cookie: str) -> str:
     return hashlib.sha256(cookie.encode()).hexdigest()
-
-
-def _sessions_of(path: Path) -> dict[str, Session]:
-    found: dict[str, Session] = {}
-    for name, one in (read_json(path) or {}).items():
-        with suppress(TypeError, ValueError):
-            session = Session(**one)
-            if isinstance(session.user, str) and isinstance(session.since, str):
-                found[name] = Session(session.user, session.since, float(session.begun_s), float(session.ends_s))
-    return found
 
 
 def _differences(before: Accounts, after: Accounts) -> Iterator[tuple[str, str]]:

@@ -73,7 +73,10 @@ class RequestGuard:
 
     def _wrong(self, connection: HTTPConnection, *, changes: bool) -> NotAllowed | None:
         host = connection.headers.get("host", "")
-        if _name_of(host) not in self._hosts:
+        name = ""
+        with suppress(ValueError):
+            name = (urlsplit(f"//{host}").hostname or "").lower()
+        if name not in self._hosts:
             return NotAllowed("this host name does not belong to the service", where=f"host {host[:100]}",
                               next_step=f"Use {', '.join(sorted(self._hosts))}")
         if connection.scope["type"] == "websocket" and token_in(connection) is not None:
@@ -87,12 +90,6 @@ class RequestGuard:
         if changes and (elsewhere or connection.headers.get("sec-fetch-site") in ("cross-site", "same-site")):
             return NotAllowed("a page of another site sent this request", where=f"origin {(origin or '?')[:100]}")
         return None
-
-
-def _name_of(host: str) -> str:
-    with suppress(ValueError):
-        return (urlsplit(f"//{host}").hostname or "").lower()
-    return ""
 
 
 async def _with_headers(send: Send, message: Message) -> None:

@@ -148,11 +148,6 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
     )
 
 
-def _plain_row(summary: Summary) -> dict[str, Any]:
-    """Return the row as values of the index: its tags are one text, and so is all that a search looks in."""
-    return {**summary.__dict__, "tags": ", ".join(summary.tags), SEARCHED_COLUMN: summary.searched}
-
-
 def _summary_of_row(plain: Mapping[str, Any]) -> Summary:
     flags = {name: bool(plain[name]) for name in ("simulated", "rehearsal", "uploaded", "archived")}
     return Summary(**{**plain, **flags, "tags": tuple(filter(None, plain["tags"].split(", ")))})
@@ -494,6 +489,7 @@ class Index:
 
     @staticmethod
     def _put(base: sqlite3.Connection, summary: Summary) -> None:
-        plain = _plain_row(summary)
+        # The tags are one text in the index, and so is all that a search looks in.
+        plain = {**summary.__dict__, "tags": ", ".join(summary.tags), SEARCHED_COLUMN: summary.searched}
         base.execute(f"insert or replace into runs ({', '.join(plain)}) values ({', '.join('?' * len(plain))})",
                      tuple(plain.values()))

@@ -112,7 +112,9 @@ class Web(Site):
             traceback.print_exception(error, file=sys.stderr)
         path, status, headers = request.url.path, None, {}
         if isinstance(error, HTTPException) and error.status_code == 405:
-            methods = ", ".join(sorted(self._methods(request)))
+            routes = [one for one in self.app.routes
+                      if isinstance(one, Route) and one.matches(request.scope)[0] is not Match.NONE]
+            methods = ", ".join(sorted({method for one in routes for method in one.methods or ()}))
             error, status, headers = UsageError(
                 f"supports {methods}, not {request.method[:20]}", where=path[:100],
                                                 entry=MessageCode.REQUEST_WRONG), 405, {"allow": methods}
@@ -127,12 +129,6 @@ class Web(Site):
         reported = error_view(error).error
         return self._pages.render(request, "error.html", "", status_of(error), reported=reported,
                                   reported_json=json.dumps(asdict(reported)))
-
-    def _methods(self, request: Request) -> set[str]:
-        """Return the methods of an address, from all of its routes."""
-        found = (one.methods for one in self.app.routes
-                 if isinstance(one, Route) and one.matches(request.scope)[0] is not Match.NONE)
-        return {method for methods in found for method in methods or ()}
 
     # -- live --------------------------------------------------------------------------------------------------------
 

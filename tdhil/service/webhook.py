@@ -49,7 +49,15 @@ class Webhook:
             raise UsageError("a user or a password must not be in the address", where="--webhook",
                              next_step=f"Put a secret into a file, and name the file in {SECRET_FILE}",
                              entry=MessageCode.SERVICE_OPTION_WRONG)
-        return Webhook(url, _secret(environment))
+        secret = None
+        if (name := environment.get(SECRET_FILE)) is not None:
+            try:
+                secret = Path(name).read_bytes().strip()
+            except OSError as error:
+                raise UsageError(f"can't be read ({error.strerror or error})", where=f"{SECRET_FILE} {name}",
+                                 next_step="The file must contain only the secret, readable by its owner only",
+                                 entry=MessageCode.SERVICE_OPTION_WRONG) from None
+        return Webhook(url, secret)
 
     @property
     def caution(self) -> str:
@@ -84,14 +92,3 @@ class Webhook:
     def __str__(self) -> str:
         parts = urlsplit(self.url)
         return f"{parts.scheme}://{parts.netloc}{parts.path}"
-
-
-def _secret(environment: Mapping[str, str]) -> bytes | None:
-    if (name := environment.get(SECRET_FILE)) is None:
-        return None
-    try:
-        return Path(name).read_bytes().strip()
-    except OSError as error:
-        raise UsageError(f"can't be read ({error.strerror or error})", where=f"{SECRET_FILE} {name}",
-                         next_step="The file must contain only the secret, readable by its owner only",
-                         entry=MessageCode.SERVICE_OPTION_WRONG) from None
