@@ -90,9 +90,21 @@ class Relay:
             asked: Any = json.loads(said) if isinstance(said, str) else {"op": "a binary message"}
             if asked["op"] == "subscribe":
                 for one in asked["subscriptions"]:
-                    await self._subscribe(int(one["id"]), int(one["channelId"]))
+                    subscription, channel = int(one["id"]), int(one["channelId"])
+                    if channel not in CHANNELS or not 0 <= subscription < 2**32:
+                        await self._status(_ERROR, f"channel {channel} does not exist")
+                    elif channel in self._wanted:
+                        await self._status(_WARNING, f"channel {channel} is already subscribed")
+                    else:
+                        self._wanted[channel] = subscription
+                        self._new.add(channel)
             elif asked["op"] == "unsubscribe":
-                self._unsubscribe({int(one) for one in asked["subscriptionIds"]})
+                gone = {int(one) for one in asked["subscriptionIds"]}
+                for channel in [one for one, wanted_by in self._wanted.items() if wanted_by in gone]:
+                    del self._wanted[channel]
+                    self._new.discard(channel)
+                    for reader in self._readers:
+                        reader.wanted.pop(channel, None)
             else:
                 await self._status(_ERROR, f"{str(asked['op'])[:40]}: this connection is read only")
         except (ValueError, TypeError, KeyError, RecursionError):
@@ -112,22 +124,6 @@ class Relay:
 
     # -- requests of the viewer --------------------------------------------------------------------------------------
 
-    async def _subscribe(self, subscription: int, channel: int) -> None:
-        if channel not in CHANNELS or not 0 <= subscription < 2**32:
-            await self._status(_ERROR, f"channel {channel} does not exist")
-        elif channel in self._wanted:
-            await self._status(_WARNING, f"channel {channel} is already subscribed")
-        else:
-            self._wanted[channel] = subscription
-            self._new.add(channel)
-
-    def _unsubscribe(self, gone: set[int]) -> None:
-        for channel in [one for one, subscription in self._wanted.items() if subscription in gone]:
-            del self._wanted[channel]
-            self._new.discard(channel)
-            for reader in self._readers:
-                reader.wanted.pop(channel, None)
-
     # -- messages to the viewer --------------------------------------------------------------------------------------
 
     async def _introduce(self, running: Running | None) -> None:
@@ -138,7 +134,10 @@ class Relay:
                     "rehearsal": str(bool(rehearsal)).lower()}
         await self._say({"op": "serverInfo", "name": f"tdhil, rig {self.rig}{simulated}{rehearsal}", "capabilities": [],
                          "metadata": metadata, "sessionId": run or "no run"})
-        await self._say({"op": "advertise", "channels": _channels()})
+        await self._say({"op": "advertise", "channels": [
+            {"id": number, "topic": topic, "encoding": "protobuf", "schemaName": schema_name(message),
+             "schema": b64encode(schema_of(message)).decode(), "schemaEncoding": "protobuf"}
+            for number, (topic, message) in CHANNELS.items()]})
         if running is None:
             await self._status(_INFO, f"rig {self.rig} has no run; waiting for one", _WAITS)
 
@@ -203,11 +202,3 @@ class Relay:
 
     async def _say(self, message: dict[str, Any]) -> None:
         await self.send_text(json.dumps(message))
-
-
-def _channels() -> list[dict[str, Any]]:
-    return [
-        {"id": number, "topic": topic, "encoding": "protobuf", "schemaName": schema_name(message),
-         "schema": b64encode(schema_of(message)).decode(), "schemaEncoding": "protobuf"}
-        for number, (topic, message) in CHANNELS.items()
-    ]

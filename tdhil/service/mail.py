@@ -110,7 +110,9 @@ class Mail:
         """Return the e-mail on a message of `notifications`."""
         found, event = EmailMessage(), str(message["event"])
         marks = "".join(f" {mark.upper()}" for mark in ("simulated", "rehearsal", "uploaded") if message.get(mark))
-        figure = _figure(message)
+        value, low, high = (message.get(name) for name in ("inertia_kg_m2", "low_kg_m2", "high_kg_m2"))
+        interval = "" if value is None or low is None or high is None else f" ({printed_interval(low, high)})"
+        figure = "" if value is None else f"J = {value:.4g}{interval} kg·m²"
         found["Subject"] = visible(
             f"tdhil: {message['rig']}{marks}: {_EVENTS.get(event, event)}{f', {figure}' if figure else ''}"
         )[:LONGEST_SUBJECT]
@@ -131,12 +133,3 @@ class Mail:
 
     def __str__(self) -> str:
         return f"{', '.join(self.recipients)} by {self.host}:{self.port}"
-
-
-def _figure(message: Mapping[str, Any]) -> str:
-    """Return J with its interval, if the run has one."""
-    value, low, high = (message.get(name) for name in ("inertia_kg_m2", "low_kg_m2", "high_kg_m2"))
-    if value is None:
-        return ""
-    interval = "" if low is None or high is None else f" ({printed_interval(low, high)})"
-    return f"J = {value:.4g}{interval} kg·m²"

@@ -39,7 +39,9 @@ DRAFT: Final = "rig.yaml"
 
 def new_rig_view() -> NewRigView:
     """Return the fields of the machine, and every profile that ships with what it asks of the person."""
-    return NewRigView(_machine_fields(), [_view(load_profile(name)) for name in sorted(profile_names())])
+    limits = [FieldView(f"limits.{name}", Limits.model_fields[name].description or "") for name in LIMIT_KEYS]
+    string = [FieldView(name, Rig.model_fields[name].description or "") for name in STRING_KEYS]
+    return NewRigView(limits + string, [_view(load_profile(name)) for name in sorted(profile_names())])
 
 
 def _view(profile: Profile) -> ProfileView:
@@ -60,12 +62,6 @@ def _address_fields(bus: str) -> list[FieldView]:
         if field.default is None]
     beside = _beside(bus)
     return fields + [FieldView(name, "number of the drive on the bus") for name in beside]
-
-
-def _machine_fields() -> list[FieldView]:
-    """Return the fields of the machine: limits, and the keys of a drill string."""
-    return ([FieldView(f"limits.{name}", Limits.model_fields[name].description or "") for name in LIMIT_KEYS]
-            + [FieldView(name, Rig.model_fields[name].description or "") for name in STRING_KEYS])
 
 
 def draft_of(body: DraftBody) -> DraftView:

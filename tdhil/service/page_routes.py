@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -99,9 +100,8 @@ class Pages:
             version=__version__, stop_s=STOP_S, form_options=form_options,
             stated_options=[OPTION[name] for name in STATED],
             language=language, languages=self._languages.values(),
-            graphs=GRAPHS, _=language.text, word=language.word, hint=lambda option: _hint(language, option),
-            applies=lambda option, settings: _applies(language, option, settings),
-            about=lambda option: _about(language, option),
+            graphs=GRAPHS, _=language.text, word=language.word, hint=partial(_hint, language),
+            applies=partial(_applies, language), about=partial(_about, language),
             code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
             speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
         found.filters["number"] = language.number

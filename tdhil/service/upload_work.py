@@ -190,9 +190,13 @@ def identify_upload(kind: str, options: Mapping[str, Any], source: Mapping[str, 
         if kind == "trace":
             Path(LOG).unlink(missing_ok=True)
         raise
-    if has_extra():
-        _write_report(found.document, record.recording)
     document = found.document
+    if has_extra():
+        from tdhil.report import write_report
+        from tdhil.service.letterhead import stored_letterhead
+
+        with suppress(UsageError, LogError, OSError):      # the result is valid without its report
+            write_report(document, record.recording, Path("report.html"), stored_letterhead(Path("../..")))
     part = record.assumed is None and not record.whole
     code = ExitCode.PARTIAL if part and found.exit_code is ExitCode.OK else found.exit_code
     return {
@@ -201,11 +205,3 @@ def identify_upload(kind: str, options: Mapping[str, Any], source: Mapping[str, 
         "said": {**{name: document[name] for name in STATED if document[name]},
                  **({"fault": document["rehearsed_faults"]} if document["rehearsed_faults"] else {})},
     }
-
-
-def _write_report(document: Mapping[str, Any], recording: Recording) -> None:
-    from tdhil.report import write_report
-    from tdhil.service.letterhead import stored_letterhead
-
-    with suppress(UsageError, LogError, OSError):      # the result is valid without its report
-        write_report(document, recording, Path("report.html"), stored_letterhead(Path("../..")))
