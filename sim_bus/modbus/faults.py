@@ -252,7 +252,9 @@ def limited_torque(share: float) -> Act:
 
 
 def hot(temperature_c: float) -> Act:
-    """Return the fault: motor and drive have this temperature, °C."""
+    """Return the fault: motor and drive have this temperature, °C. Raises ValueError for one out of range."""
+    if not 0.0 <= temperature_c <= 300.0:
+        raise ValueError("°C, from 0 to 300")
     return Act(lambda machine: machine.heat(temperature_c), lambda machine: machine.heat(40.0))
 
 
@@ -302,12 +304,6 @@ def _delay_s(text: str) -> float:
     return float(found[1]) / (1000.0 if found[2] == "ms" else 1.0)
 
 
-def _celsius(text: str) -> float:
-    if not 0.0 <= number(text) <= 300.0:
-        raise ValueError("°C, from 0 to 300")
-    return number(text)
-
-
 def _name(text: str) -> Misbehaviour:
     if not re.fullmatch(r"[a-z][a-z0-9_]*", text):
         raise ValueError("a parameter as the profile calls it")
@@ -333,7 +329,7 @@ KINDS: Kinds[Misbehaviour] = Kinds({
                                 lambda v: limited_torque(share(v)), "10%", "SHARE"),
     "load-lost": FaultKind(34, "the load comes off: this share of inertia and friction is left",
                            lambda v: load_lost(max(0.001, share(v))), "10%", "SHARE"),
-    "hot": FaultKind(35, "motor and drive become so hot, °C", lambda v: hot(_celsius(v)), "150", "CELSIUS"),
+    "hot": FaultKind(35, "motor and drive become so hot, °C", lambda v: hot(number(v)), "150", "CELSIUS"),
     "exception": FaultKind(38, "every request is answered by this exception and not done: 1 to 4, 6 busy",
                            lambda v: Refusing(_code(v)), "4", "CODE"),
     "no-reply": FaultKind(39, "this share of the requests doesn't get through, and nothing comes back",

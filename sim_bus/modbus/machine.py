@@ -78,7 +78,14 @@ class Machine:
                  wrongs: tuple[Wrong, ...] = (), stepped: bool = True) -> None:
         self._profile = profile
         self.parameters = ParameterStore(profile, params, wrongs)
-        self.inverter = Inverter(self._worn(params), np.random.default_rng(seed))
+        # The reporting lags are those of the profile's drive, and the quantisation is that of the registers.
+        reporting: dict[str, float] = {"speed_quantum_rpm": 0.0, "torque_quantum_permille": 0.0}
+        for signal in ("speed", "torque"):
+            lag_s = reporting_lag_s(profile, self.parameters, signal)
+            if lag_s is not None:
+                reporting[f"{signal}_lag_s"] = lag_s
+        rig = params.model_copy(update={"reporting": params.reporting.model_copy(update=reporting)})
+        self.inverter = Inverter(rig, np.random.default_rng(seed))
         self.application = application = Application(self.inverter)
         wiring = _wiring(profile)
         application.set_mode((OperationMode.PROFILE_VELOCITY if wiring.ramps else OperationMode.CYCLIC_VELOCITY).value)
@@ -169,15 +176,6 @@ class Machine:
         self.close()
 
     # -- inside --------------------------------------------------------------------------------------------
-
-    def _worn(self, params: RigParams) -> RigParams:
-        """Return the rig with the reporting lags of the profile's drive. The quantisation is that of the registers."""
-        reporting: dict[str, float] = {"speed_quantum_rpm": 0.0, "torque_quantum_permille": 0.0}
-        for signal in ("speed", "torque"):
-            lag_s = reporting_lag_s(self._profile, self.parameters, signal)
-            if lag_s is not None:
-                reporting[f"{signal}_lag_s"] = lag_s
-        return params.model_copy(update={"reporting": params.reporting.model_copy(update=reporting)})
 
     def _written(self) -> None:
         self._obey_parameters()

@@ -156,7 +156,16 @@ class DrillString:
         """Advance the waves by one cell and the bottom by one tick."""
         down, up, twice = state.down_nm, state.up_nm, 2.0 * self.impedance_nm_s_rad
         arrived = down.item(-1)
-        speed, angle, bristle, travel = self._bottom_end(state, arrived, bottom_load_nm)
+        speed = bristle = travel = 0.0             # of a clamped bottom
+        if self.params.bottom_end == "free":
+            speed = arrived / (self.impedance_nm_s_rad + 0.5 * self._drag)
+            travel = speed * self.tick_s
+        elif self.params.bottom_end != "clamped":
+            shaft = self._bottom
+            speed, bristle, travel = self._bottom_move(
+                shaft, state.bottom_speed_rad_s, state.bottom_bristle_rad, arrived - shaft.load_nm - bottom_load_nm,
+                self.tick_s)
+        angle = state.bottom_angle_rad + travel
         falling, rising = down[:-1], up[1:]        # waves that meet between two cells
         between = falling + rising
         between *= self._pass
@@ -168,22 +177,6 @@ class DrillString:
         new_up[-1] = twice * travel / self.tick_s - arrived
         return StringState(state.speed_rad_s, state.angle_rad, state.bristle_rad, speed, angle, bristle,
                            new_down, new_up, 0.0, state.angle_rad)
-
-    def _bottom_end(
-        self, state: StringState, arrived: float, load_nm: float
-    ) -> tuple[float, float, float, float]:
-        """Return (speed, angle, bristle, travel) of the bottom after a tick."""
-        angle = state.bottom_angle_rad
-        if self.params.bottom_end == "clamped":
-            return 0.0, angle, 0.0, 0.0
-        if self.params.bottom_end == "free":
-            speed = arrived / (self.impedance_nm_s_rad + 0.5 * self._drag)
-            return speed, angle + speed * self.tick_s, 0.0, speed * self.tick_s
-        shaft = self._bottom
-        speed, bristle, travel = self._bottom_move(
-            shaft, state.bottom_speed_rad_s, state.bottom_bristle_rad, arrived - shaft.load_nm - load_nm,
-            self.tick_s)
-        return speed, angle + travel, bristle, travel
 
     def _with_string(self, shaft: ShaftParams) -> ShaftParams:
         seen = shaft.viscous_nm_s_rad + self.impedance_nm_s_rad + 0.5 * self._drag
