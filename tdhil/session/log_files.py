@@ -92,8 +92,15 @@ class LogPlace:
 
     def name(self, *, stub: bool) -> Path:
         """Return the file's final path. ``stub``: nothing moved in this run."""
-        if stub and self.older is not None and not _is_stub(self.older):
-            return self.wanted.with_name(f"{self.wanted.stem}.refused{self.wanted.suffix}")
+        if not stub or self.older is None:
+            return self.path
+        from tdhil.errors import LogError
+        from tdhil.recording import read_run
+
+        with suppress(OSError, LogError):      # an older log that holds no motion either, or is unreadable, gives way
+            if self.older.stat().st_size >= _LARGEST_STUB or any(
+                    stage.name != "setup" for stage in read_run(self.older).stages):
+                return self.wanted.with_name(f"{self.wanted.stem}.refused{self.wanted.suffix}")
         return self.path
 
     def settle(self, *, stub: bool) -> None:
@@ -168,18 +175,6 @@ def _dated(path: Path, time_s: float) -> Path:
         number += 1
         dated = path.with_name(f"{path.stem}-{stamp}-{number}{path.suffix}")
     return dated
-
-
-def _is_stub(path: Path) -> bool:
-    """Return whether an older log holds no motion either."""
-    from tdhil.errors import LogError
-    from tdhil.recording import read_run
-
-    with suppress(OSError, LogError):
-        return path.stat().st_size < _LARGEST_STUB and not any(
-            stage.name != "setup" for stage in read_run(path).stages
-        )
-    return True
 
 
 @contextmanager
