@@ -148,11 +148,6 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
     )
 
 
-def _summary_of_row(plain: Mapping[str, Any]) -> Summary:
-    flags = {name: bool(plain[name]) for name in ("simulated", "rehearsal", "uploaded", "archived")}
-    return Summary(**{**plain, **flags, "tags": tuple(filter(None, plain["tags"].split(", ")))})
-
-
 class Store:
     """The folder of one service. Any thread may call its methods."""
 
@@ -252,6 +247,15 @@ class Store:
         if request.idempotency_key is not None:
             kept = [*self._deleted_keys(), [request.id, request.rig, request.idempotency_key, request.asked_by]]
             write_json(self.folder / _DELETED_KEYS, {"runs": kept[-KEYS:]})
+
+    def request_with_key(self, rig: str, key: str, who: str) -> StoredRequest | None:
+        """Return this user's request of this rig with this key, among the newest runs; None if there is none."""
+        for run in self.ids()[:KEYS]:
+            with suppress(Exception):
+                request = self.request(run)
+                if (request.rig, request.idempotency_key, request.asked_by) == (rig, key, who):
+                    return request
+        return None
 
     def deleted_with_key(self, rig: str, key: str, who: str) -> str | None:
         """Return the deleted run that this user requested of this rig with this key; None if there is none."""
@@ -383,7 +387,13 @@ class Index:
                 f"select {', '.join(_COLUMNS)} from runs {clause} {order.sql} limit ? offset ?",
                 (*values, limit, offset),
             ).fetchall()
-        return [_summary_of_row(dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+        found = []
+        for row in rows:
+            plain = dict(zip(_COLUMNS, row, strict=True))
+            flags = {name: bool(plain[name]) for name in ("simulated", "rehearsal", "uploaded", "archived")}
+            tags = tuple(filter(None, plain["tags"].split(", ")))
+            found.append(Summary(**{**plain, **flags, "tags": tags}))
+        return found
 
     def count(self, wanted: RunFilter, without: Collection[str] = ()) -> int:
         """Return the number of matching rows. Raises sqlite3.Error."""

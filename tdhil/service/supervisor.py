@@ -58,7 +58,6 @@ from tdhil.service.start_request import (
 )
 from tdhil.service.store import (
     CONNECTION_FILE,
-    KEYS,
     Index,
     Store,
     StoredRequest,
@@ -243,7 +242,7 @@ class Supervisor:
         require_motion(rig)
         rig.way(options)               # contradictions between options are reported now, not by the run
         with self._asking:
-            if key is not None and (before := self._by_key(rig_id, key, who)) is not None:
+            if key is not None and (before := self.store.request_with_key(rig_id, key, who)) is not None:
                 if dict(before.options) != options:
                     raise Conflict("this key was used for another request", where="Idempotency-Key",
                                    next_step="Use a new key")
@@ -534,14 +533,6 @@ class Supervisor:
         return found
 
     # -- supervision of the runs ---------------------------------------------------------------------------------
-
-    def _by_key(self, rig: str, key: str, who: str) -> StoredRequest | None:
-        for run in self.store.ids()[:KEYS]:
-            with suppress(Exception):
-                request = self.store.request(run)
-                if (request.rig, request.idempotency_key, request.asked_by) == (rig, key, who):
-                    return request
-        return None
 
     def _begin(self, run: str) -> None:
         folder = self.store.place(run)

@@ -20,8 +20,7 @@ from tdhil.service import supervisor as supervisor_module
 from tdhil.service.limits import STOP_S
 from tdhil.service.run_channel import STOP_FILE, RunRefused
 from tdhil.service.run_state import Conflict, NoRoom, State, Status, now, way_to
-from tdhil.service.store import StoredRequest
-from tdhil.service.supervisor import KEYS
+from tdhil.service.store import KEYS, StoredRequest
 from tdhil.session import drive_lock
 from tests.service.conftest import FAKE, Service, wait_for
 
