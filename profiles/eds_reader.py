@@ -254,16 +254,15 @@ class _Reader:
         profile needs.
         """
         out = io.StringIO()
-        for rank in range(4):
-            for name, section in self._sections.items():
-                parent = self._sections.get(name[:4])
-                kind = parent.values.get("ObjectType", "") if parent else ""
-                # Object types 0, 5 and 6 only define a type.
-                if _rank(name) == rank and not (kind and int(kind, 0) in (0, 5, 6)):
-                    out.write(f"[{name}]\n")
-                    kept = _KEPT.get(name, section.values)
-                    values = section.values | ({} if name in _KEPT else {"ParameterName": name})
-                    out.writelines(_pair(key, values[key]) for key in kept if values.get(key))
+        for name in sorted(self._sections, key=_rank):
+            section, parent = self._sections[name], self._sections.get(name[:4])
+            kind = parent.values.get("ObjectType", "") if parent else ""
+            # Object types 0, 5 and 6 only define a type.
+            if _rank(name) < 4 and not (kind and int(kind, 0) in (0, 5, 6)):
+                out.write(f"[{name}]\n")
+                kept = _KEPT.get(name, section.values)
+                values = section.values | ({} if name in _KEPT else {"ParameterName": name})
+                out.writelines(_pair(key, values[key]) for key in kept if values.get(key))
         return out.getvalue()
 
     def section_of(self, index: int, sub: int, *, alone: bool) -> tuple[str, int]:
