@@ -88,24 +88,23 @@ class Pages:
     def __init__(self, site: Site) -> None:
         self._site = site
         self._languages = languages()
-        self._templates = {tag: self._environment(one) for tag, one in self._languages.items()}
-
-    def _environment(self, language: Language) -> Environment:
-        """Return the templates in a language. In them ``_("text")`` is a text, and ``word(text)`` one that varies."""
-        found = Environment(
-            loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        found.globals.update(
-            version=__version__, stop_s=STOP_S, form_options=form_options,
-            stated_options=[OPTION[name] for name in STATED],
-            language=language, languages=self._languages.values(),
-            graphs=GRAPHS, _=language.text, word=language.word, hint=partial(_hint, language),
-            applies=partial(_applies, language), about=partial(_about, language),
-            code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
-            speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
-        found.filters["number"] = language.number
-        return found
+        self._templates: dict[str, Environment] = {}
+        for tag, language in self._languages.items():
+            # In a template ``_("text")`` is a text, and ``word(text)`` one that varies.
+            found = Environment(
+                loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
+                trim_blocks=True, lstrip_blocks=True,
+            )
+            found.globals.update(
+                version=__version__, stop_s=STOP_S, form_options=form_options,
+                stated_options=[OPTION[name] for name in STATED],
+                language=language, languages=self._languages.values(),
+                graphs=GRAPHS, _=language.text, word=language.word, hint=partial(_hint, language),
+                applies=partial(_applies, language), about=partial(_about, language),
+                code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
+                speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
+            found.filters["number"] = language.number
+            self._templates[tag] = found
 
     def render(self, request: Request, template: str, here: str, status: int = 200, **known: Any) -> Response:
         """Return a page in the language of the request. ``here``: the page's entry in the menu."""

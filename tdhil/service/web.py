@@ -76,9 +76,13 @@ class Web(Site):
         super().__init__(supervisor, access=access, logs=logs, upload_limit=upload_limit)
         self._complain = Seldom(supervisor.say)
         self._pages = Pages(self)
+        serve = {"watch": self._watch, "foxglove": self._foxglove}
+        sockets: list[BaseRoute] = []          # below the API and at the root
+        for path, one in ((f"{base}{one.path}", one) for base in (API, "") for one in SOCKETS):
+            sockets += [WebSocketRoute(path, self._socket(one.role, serve[one.name])),
+                        Route(path, self._no_socket(one.role))]
         self.app = Starlette(
-            routes=[*(one for subject in SUBJECTS for one in subject.routes(self)), *self._sockets(),
-                    *self._pages.routes()],
+            routes=[*(one for subject in SUBJECTS for one in subject.routes(self)), *sockets, *self._pages.routes()],
             lifespan=self._lifespan,
             middleware=[Middleware(AuthenticationMiddleware, backend=self.access)],
             exception_handlers=dict.fromkeys((TdhilError, HTTPException, OSError, Exception), self._failed),
@@ -131,15 +135,6 @@ class Web(Site):
                                   reported_json=json.dumps(asdict(reported)))
 
     # -- live --------------------------------------------------------------------------------------------------------
-
-    def _sockets(self) -> list[BaseRoute]:
-        """Return the routes of the sockets, below the API and at the root."""
-        serve = {"watch": self._watch, "foxglove": self._foxglove}
-        found: list[BaseRoute] = []
-        for path, one in ((f"{base}{one.path}", one) for base in (API, "") for one in SOCKETS):
-            found += [WebSocketRoute(path, self._socket(one.role, serve[one.name])),
-                      Route(path, self._no_socket(one.role))]
-        return found
 
     def _socket(
         self, role: Role, serve: Callable[[WebSocket], Awaitable[None]]
