@@ -115,7 +115,26 @@ def _initial(
     elif parameter.default is not None:
         wanted = parameter.default
     else:
-        wanted = _of_rig(store, rig, parameter, rated_rpm)
+        drive, signed = rig.drive, parameter.register_ is None or parameter.register_.type[0] == "i"
+        sign = -1.0 if signed else 1.0
+        match parameter.set_to:
+            case "speed_limit":
+                wanted = drive.speed_limit_rpm
+            case "speed_limit_reverse":
+                wanted = sign * drive.speed_limit_rpm
+            case "torque_limit":
+                wanted = store.in_unit(drive.torque_limit_nm, parameter.unit)
+            case "torque_limit_reverse":
+                wanted = sign * store.in_unit(drive.torque_limit_nm, parameter.unit)
+            case "quick_stop_deceleration":
+                wanted = QUICK_STOP_RAD_S2 / RPM
+            case "quick_stop_time":
+                from_rpm = store.value(parameter.times) if parameter.times is not None else rated_rpm
+                wanted = from_rpm * RPM / QUICK_STOP_RAD_S2
+            case _:
+                by_unit = {"rpm": rated_rpm, "nm": drive.rated_torque_nm, "rated": 1.0,
+                           "kw": drive.rated_torque_nm * rated_rpm * RPM / 1000.0}
+                wanted = by_unit.get(parameter.unit, 0.0)
     require = parameter.require
     return wanted if require is None or meets(wanted, require) else value_that_meets(require)
 
@@ -129,29 +148,6 @@ def _lag_s(profile: ModbusProfile, rig: RigParams, name: str) -> float | None:
         if name in names:
             return lag_s if name == names[0] else 0.0
     return None
-
-
-def _of_rig(store: ParameterStore, rig: RigParams, parameter: Parameter, rated_rpm: float) -> float:
-    drive = rig.drive
-    kind = parameter.register_.type if parameter.register_ is not None else "i32"
-    sign = -1.0 if kind[0] == "i" else 1.0
-    match parameter.set_to:
-        case "speed_limit":
-            return drive.speed_limit_rpm
-        case "speed_limit_reverse":
-            return sign * drive.speed_limit_rpm
-        case "torque_limit":
-            return store.in_unit(drive.torque_limit_nm, parameter.unit)
-        case "torque_limit_reverse":
-            return sign * store.in_unit(drive.torque_limit_nm, parameter.unit)
-        case "quick_stop_deceleration":
-            return QUICK_STOP_RAD_S2 / RPM
-        case "quick_stop_time":
-            from_rpm = store.value(parameter.times) if parameter.times is not None else rated_rpm
-            return from_rpm * RPM / QUICK_STOP_RAD_S2
-    by_unit = {"rpm": rated_rpm, "nm": drive.rated_torque_nm, "rated": 1.0,
-               "kw": drive.rated_torque_nm * rated_rpm * RPM / 1000.0}
-    return by_unit.get(parameter.unit, 0.0)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
