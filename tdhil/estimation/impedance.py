@@ -144,7 +144,9 @@ def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[ImpedanceLine, 
     """Return the lines of the longest run of whole periods of every segment; () if a segment has too few periods."""
     pieces = []
     for stretch, fit_ in zip(case.stretches, case.fits, strict=True):
-        run = _longest_run(stretch)
+        # positions in `periods` of the longest run of consecutive periods
+        runs = np.split(np.arange(len(stretch.index)), np.flatnonzero(np.diff(stretch.index) != 1) + 1)
+        run = tuple(max(runs, key=len).tolist())
         if len(run) < _LEAST_PERIODS:
             return ()
         pieces.append((stretch.segment.lines_hz, commanded(stretch, asked), *_spectrum(stretch, run, fit_.rounding)))
@@ -161,19 +163,6 @@ def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[ImpedanceLine, 
                  covariance, nu)
         )
     return tuple(found)
-
-
-def _longest_run(stretch: Stretch) -> tuple[int, ...]:
-    """Return the positions in ``stretch.periods`` of the longest run of consecutive periods."""
-    best: tuple[int, ...] = ()
-    now: list[int] = []
-    for number, index in enumerate(stretch.index):
-        if now and index != stretch.index[now[-1]] + 1:
-            now = []
-        now.append(number)
-        if len(now) > len(best):
-            best = tuple(now)
-    return best
 
 
 def _spectrum(
@@ -643,9 +632,14 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
     shows = _undeclared(problem, fitted, confidence) if asked.by == REFERENCE else None
     p_value = 1.0 if test is None else test.p_value
     if shows is not None:
-        other, expected = _filter_words(problem.declared_s, *shows)
+        seen, instead = shows
+        other = f"one of {seen.value:.3g} s ({printed_interval(seen.low, seen.high, 3)})"
+        expected = "no reference filter"
+        if problem.declared_s > 0.0:
+            other = f"{other} in place of it" if instead else f"a further {other} besides it"
+            expected = f"the declared reference filter of {problem.declared_s:g} s"
         return replace(
-            bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=shows[0],
+            bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=seen,
             reason=f"the residuals contradict a speed loop with {expected} (p = {p_value:.2g}): {other} would explain"
             " them",
             advice="measure with --impedance offset: a reference filter does not affect it. Or disable the "
@@ -659,14 +653,21 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProbl
             " ramp, notch); report filters other than first-order lags.",
         )
     spread = _ThetaSpread(problem, fitted, confidence, _small_filter(problem, fitted, confidence))
-    gain_sd, integral_sd = _gain_sds(fitted.theta, 0.0 if asked.by == OFFSET else _ratio_rel_sd(case, asked))
+    # further standard uncertainties of P and I, from the drive's unknown rule of integration and the ratio of the
+    # torque scales
+    ratio_rel_sd = 0.0 if asked.by == OFFSET else _ratio_rel_sd(case, asked)
+    fitted_gain, fitted_integral = float(fitted.theta[GAIN]), float(fitted.theta[INTEGRAL])
+    sampled_sd = fitted_integral * 0.5 * CONTROL_PERIOD_S / math.sqrt(3.0)
     integral, inertia, viscous = spread.around(
-        lambda theta: theta[[INTEGRAL, INERTIA, VISCOUS]], np.array([integral_sd, 0.0, 0.0]))
-    rows, extra = _rows(), np.array([gain_sd, 0.0, 0.0, 0.0])
+        lambda theta: theta[[INTEGRAL, INERTIA, VISCOUS]], np.array([ratio_rel_sd * fitted_integral, 0.0, 0.0]))
+    rows, extra = _rows(), np.array([math.hypot(sampled_sd, ratio_rel_sd * fitted_gain), 0.0, 0.0, 0.0])
     gain = spread.around(lambda theta: theta[[GAIN]], extra[:1])[0]
     wide = not gain.bounded
-    if wide and not (gain.finite and _bounded_at_ratio(problem, fitted, confidence)):
-        return replace(bare, reason="the data do not determine the gain of the loop", advice=_MORE)
+    if wide:      # allowed only if P would be bounded with the ratio of the torque scales known exactly
+        exact = replace(fitted, inside=fitted.inside & (np.arange(_SIZE) != TORQUE_RATIO))
+        if not (gain.finite
+                and _ThetaSpread(problem, exact, confidence).around(lambda theta: theta[[GAIN]])[0].bounded):
+            return replace(bare, reason="the data do not determine the gain of the loop", advice=_MORE)
     gain, inner, torque_lag, speed_filter = spread.at_least_zero(rows, extra_sd=extra, profiled=wide)
     explained = "untested" if test is None else f"p = {p_value:.2g}"
     return replace(
@@ -700,23 +701,6 @@ def _rows() -> FloatArray:
                                strict=True):
         row[list(parameters)] = 1.0
     return rows
-
-
-def _bounded_at_ratio(problem: ImpedanceProblem, fitted: FittedImpedance, confidence: float) -> bool:
-    """Return whether P would be bounded if the ratio of the torque scales were known exactly."""
-    inside = fitted.inside & (np.arange(_SIZE) != TORQUE_RATIO)
-    exact = _ThetaSpread(problem, replace(fitted, inside=inside), confidence)
-    return exact.around(lambda theta: theta[[GAIN]])[0].bounded
-
-
-def _gain_sds(theta: FloatArray, ratio_rel_sd: float) -> tuple[float, float]:
-    """Return further standard uncertainties of P, N·m·s/rad, and I, N·m/rad.
-
-    Their sources are the drive's unknown rule of integration and the ratio of the torque scales.
-    """
-    gain, integral = float(theta[GAIN]), float(theta[INTEGRAL])
-    sampled = integral * 0.5 * CONTROL_PERIOD_S / math.sqrt(3.0)
-    return math.hypot(sampled, ratio_rel_sd * gain), ratio_rel_sd * integral
 
 
 def _not_below_zero(one: Estimate) -> Estimate:
@@ -762,17 +746,6 @@ def _small_filter(problem: ImpedanceProblem, plain: FittedImpedance, confidence:
             break
         largest, start = fitted, fitted.theta.copy()
     return None if largest is None else _ThetaSpread(problem, largest, confidence)
-
-
-def _filter_words(declared_s: float, shows: Estimate, instead: bool) -> tuple[str, str]:
-    """Return the texts for the filter that the data show and for the expected one."""
-    other = f"one of {shows.value:.3g} s ({printed_interval(shows.low, shows.high, 3)})"
-    if declared_s <= 0.0:
-        return other, "no reference filter"
-    expected = f"the declared reference filter of {declared_s:g} s"
-    if instead:
-        return f"{other} in place of it", expected
-    return f"a further {other} besides it", expected
 
 
 def _points(
