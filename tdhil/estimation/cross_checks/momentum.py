@@ -313,7 +313,15 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
         return None
     periodic = periodic_segments(recording)
     calm = calm_spans(blocks, periodic)
-    knots = [knot for span in calm for knot in _calm_knots(span, _CLOSER_S if alone else _APART_S)]
+    knots = []
+    for span in calm:      # both ends and every few seconds between; the middle of a short stretch
+        count = 1 + int((span.duration_s - KNOT_S) / (_CLOSER_S if alone else _APART_S))
+        if count == 1:
+            middle = 0.5 * (span.start_s + span.end_s)
+            knots.append(Knot(middle - 0.5 * KNOT_S, middle + 0.5 * KNOT_S))
+        else:
+            starts = np.linspace(span.start_s, span.end_s - KNOT_S, count)
+            knots += [Knot(float(start), float(start) + KNOT_S) for start in starts]
     for segment in periodic:      # the first and the last whole period
         start, period = segment.start_s, segment.period_s
         last = start + (int((segment.end_s - start) / period + 1e-6) - 1) * period
@@ -324,8 +332,13 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
     speeds = np.array([_mean_speed(samples, knot) for knot in knots])
     direction = float(np.sign(np.nansum(speeds)))
     low, high = _seen(blocks, knots, direction)
-    coasts = coasting_spans(blocks, calm, recording.torque_resolution_nm)
-    knots += [knot for span in coasts for knot in _coast_knots(span, blocks, direction, low)]
+    for span in coasting_spans(blocks, calm, recording.torque_resolution_nm):
+        # from settled reports to the speed where friction is unknown, or to the end of the coasting
+        inside = (blocks.time_s > span.start_s) & (blocks.time_s < span.end_s) & (blocks.speed_rad_s * direction >= low)
+        start = span.start_s + _COAST_ENTRY_S
+        end = float(blocks.time_s[inside][-1]) if np.any(inside) else start
+        if end - start >= 3.0 * _COAST_KNOT_S:
+            knots += [Knot(at, at + _COAST_KNOT_S, coasting=True) for at in (start, end - _COAST_KNOT_S)]
     knots.sort(key=lambda knot: (knot.start_s, knot.end_s))
     found = []
     for first, second in pairwise(knots):
@@ -376,18 +389,6 @@ def _seen(blocks: Blocks, knots: list[Knot], direction: float) -> tuple[float, f
     return _BEYOND * float(ahead.min()), float(ahead.max()) / _BEYOND
 
 
-def _calm_knots(span: Span, apart_s: float) -> list[Knot]:
-    """Return knots at both ends of a steady stretch and every few seconds between; one in the middle of a short
-    stretch.
-    """
-    count = 1 + int((span.duration_s - KNOT_S) / apart_s)
-    if count == 1:
-        middle = 0.5 * (span.start_s + span.end_s)
-        return [Knot(middle - 0.5 * KNOT_S, middle + 0.5 * KNOT_S)]
-    starts = np.linspace(span.start_s, span.end_s - KNOT_S, count)
-    return [Knot(float(start), float(start) + KNOT_S) for start in starts]
-
-
 def _stage_knots(recording: Recording, samples: Samples, blocks: Blocks, others: list[Knot]) -> list[Knot]:
     """Return knots at the end of stages 2 and 4, where the shaft reached a speed but did not stay there for long.
 
@@ -403,16 +404,6 @@ def _stage_knots(recording: Recording, samples: Samples, blocks: Blocks, others:
             if np.all(np.abs(blocks.acceleration_rad_s2[inside]) <= _SETTLING_PER_S * reach):
                 found.append(knot)
     return found
-
-
-def _coast_knots(span: Span, blocks: Blocks, direction: float, low: float) -> list[Knot]:
-    """Return knots from settled reports to the speed where friction is unknown, or to the end of the coasting."""
-    inside = (blocks.time_s > span.start_s) & (blocks.time_s < span.end_s) & (blocks.speed_rad_s * direction >= low)
-    start = span.start_s + _COAST_ENTRY_S
-    end = float(blocks.time_s[inside][-1]) if np.any(inside) else start
-    if end - start < 3.0 * _COAST_KNOT_S:
-        return []
-    return [Knot(at, at + _COAST_KNOT_S, coasting=True) for at in (start, end - _COAST_KNOT_S)]
 
 
 def _mean_speed(samples: Samples, knot: Knot) -> float:

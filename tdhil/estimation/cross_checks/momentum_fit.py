@@ -90,7 +90,9 @@ def fit_momentum(
     count = sum(1 for row in rows if row.kind is kind and changes(row))
     if count == 0 or len(rows) < 3:
         return None
-    covariance = _covariance(rows)
+    covariance = np.diag([row.energy_s for row in rows])
+    for i, (earlier, later) in enumerate(pairwise(rows)):
+        covariance[i, i + 1] = covariance[i + 1, i] = overlap_s(earlier, later)
     inverse = np.linalg.inv(np.linalg.cholesky(covariance))
     impulse = inverse @ np.array([row.impulse_nm_s for row in rows])
 
@@ -162,13 +164,6 @@ def _bent(
         return _UNSEEN_BEND * inertia
     change = abs(float(x[0]) - inertia)
     return change if rest - left > _BEND_SHOWS * density else min(change, _UNSEEN_BEND * inertia)
-
-
-def _covariance(rows: list[BalanceRow]) -> FloatArray:
-    covariance = np.diag([row.energy_s for row in rows])
-    for i, (earlier, later) in enumerate(pairwise(rows)):
-        covariance[i, i + 1] = covariance[i + 1, i] = overlap_s(earlier, later)
-    return covariance
 
 
 def _design(rows: list[BalanceRow], delay_s: float, direction: float, share: float) -> FloatArray:

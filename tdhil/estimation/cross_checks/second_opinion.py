@@ -60,7 +60,15 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     fitted = _fitted_opinions(case, finding)
     opinions = tuple(opinion for opinion, _ in fitted)
     warnings = (*finding.warnings, *disagreements(opinions, finding))
-    before = _before_acquisition(case, finding)
+    # If a signal changes its scale during the run, the balances of the whole run contradict one another, and their
+    # interval becomes so wide that J agrees with it. The balances before stage 5 do not have this problem.
+    begun = next((stage.start_s for stage in case.recording.stages if stage.name == _ACQUISITION), None)
+    before: Fitted = ()
+    if begun is not None:
+        earlier = replace(
+            case, recording=replace(case.recording, excitation=None), samples=case.samples.between(-math.inf, begun))
+        before = tuple((replace(opinion, route=f"{opinion.route} before stage 5"), fit)
+                       for opinion, fit in _fitted_opinions(earlier, finding, alone=True))
     against = (*fitted, *before)
     reference, confidence = reference_inertia(finding), case.options.confidence
     if opinions and before and reference is not None and reference.finite and reference.value > 0.0:
@@ -71,8 +79,13 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
         note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
         opinions = (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
     elif case.recording.has_drill_string and finding.inertia and all(one.agrees is None for one in opinions):
-        hidden, warning = _hidden_change(case)
-        warnings = (*warnings, warning)
+        # the least change of the torque scale that the mean torques show, as no momentum balance can be compared with J
+        ratios = [one.ratio for one in level_torques(case.recording, case.samples) if one.ratio > 0.0]
+        hidden = min((max(ratio / LEAST, MOST / ratio) - 1.0 for ratio in ratios), default=None)
+        amount = "" if hidden is None else f" of less than {hidden:.0%}"
+        warnings = (*warnings, CodedText(
+            f"this run does not show a change{amount} in the scale of torque or speed. If a scale changed, J has an "
+            "error of that size", MessageCode.SCALE_CHANGE_HIDDEN))
         if opinions and hidden is not None:
             opinions = (replace(opinions[0], least_scale_change=hidden), *opinions[1:])
     inertia = _inertia(case, finding, opinions)
@@ -123,21 +136,6 @@ def _fitted_opinions(case: Case, finding: Finding, *, alone: bool = False) -> Fi
     )
 
 
-def _before_acquisition(case: Case, finding: Finding) -> Fitted:
-    """Return the cross-checks from the recording before stage 5 only.
-
-    If a signal changes its scale during the run, the balances of the whole run contradict one another, and their
-    interval becomes so wide that J agrees with it. The balances before stage 5 do not have this problem.
-    """
-    begun = next((stage.start_s for stage in case.recording.stages if stage.name == _ACQUISITION), None)
-    if begun is None:
-        return ()
-    before = replace(
-        case, recording=replace(case.recording, excitation=None), samples=case.samples.between(-math.inf, begun))
-    named = _fitted_opinions(before, finding, alone=True)
-    return tuple((replace(opinion, route=f"{opinion.route} before stage 5"), fit) for opinion, fit in named)
-
-
 def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Refusal:
     """Return the contradiction of J beyond chance and beyond the effect of nonlinear friction on a balance; else
     nothing.
@@ -161,19 +159,6 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 "the run", entry=MessageCode.METHODS_CONTRADICT,
             )
     return Refusal("", "")
-
-
-def _hidden_change(case: Case) -> tuple[float | None, CodedText]:
-    """Return the least change of the torque scale that the mean torques show, and the warning of a smaller one.
-
-    For a run above a string, if no momentum balance can be compared with J.
-    """
-    ratios = [one.ratio for one in level_torques(case.recording, case.samples) if one.ratio > 0.0]
-    least = min((max(ratio / LEAST, MOST / ratio) - 1.0 for ratio in ratios), default=None)
-    amount = "" if least is None else f" of less than {least:.0%}"
-    return least, CodedText(
-        f"this run does not show a change{amount} in the scale of torque or speed. If a scale changed, J has an error "
-        "of that size", MessageCode.SCALE_CHANGE_HIDDEN)
 
 
 def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:

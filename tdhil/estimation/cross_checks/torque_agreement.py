@@ -310,24 +310,20 @@ def _contradiction(found: TorqueRatio, allowed: float) -> str:
     if found.demanded_rms_nm is not None:
         values.append(f"demanded {found.demanded_rms_nm:.4g}")
     values.append(f"reported {found.reported_rms_nm:.4g} N·m")
+    which = ""      # signal that differs from the other two, if three are known
+    if found.demanded_ratio is not None:
+        tolerance = _FITS * abs(found.ratio.value - 1.0)
+        if abs(found.demanded_ratio - 1.0) < tolerance:
+            which = "; the demanded torque agrees with the commanded one, but the reported torque does not"
+        elif abs(found.ratio.value / found.demanded_ratio - 1.0) < tolerance:
+            which = "; demanded and reported torque agree, but the commanded torque does not"
+        else:
+            which = "; no two of the three agree"
     return (
         f"the drive's torque signals contradict each other ({', '.join(values)}, root mean square): {_sentence(found)},"
-        f" and the torque scale allows ±{allowed:.2g}{_which(found)}; everything that comes from the reported torque"
+        f" and the torque scale allows ±{allowed:.2g}{which}; everything that comes from the reported torque"
         " may be wrong by that factor"
     )
-
-
-def _which(found: TorqueRatio) -> str:
-    """Return which signal differs from the other two, if three are known."""
-    if found.demanded_ratio is None:
-        return ""
-    share = found.ratio.value / found.demanded_ratio
-    tolerance = _FITS * abs(found.ratio.value - 1.0)
-    if abs(found.demanded_ratio - 1.0) < tolerance:
-        return "; the demanded torque agrees with the commanded one, but the reported torque does not"
-    if abs(share - 1.0) < tolerance:
-        return "; demanded and reported torque agree, but the commanded torque does not"
-    return "; no two of the three agree"
 
 
 def _advice(found: TorqueRatio) -> str:
