@@ -596,8 +596,17 @@ def _stands(chosen: Chosen, result: CompliantResult, case: PeriodicCase, rigid: 
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if chosen.impedance_ratio is not None:
         # a J that does not stand gets no further figures, as for residuals that contradict the model
-        return Finding(model=name, words=finding.words, residual=fit.residual, lines=finding.lines, curve=finding.curve,
-                       contradiction=_pipe_contradiction(chosen.impedance_ratio))
+        least, most = _PIPE_RATIOS
+        return Finding(
+            model=name, words=finding.words, residual=fit.residual, lines=finding.lines, curve=finding.curve,
+            contradiction=Refusal(
+                f"the string has {chosen.impedance_ratio:.2f} times the characteristic impedance of the pipe in"
+                f" rig.yaml (limits {least:g} to {most:g}), and its travel time is that of the pipe: the scale of"
+                " torque or speed is wrong by this factor, or the pipe's diameters are",
+                "compare the diameters in rig.yaml with the pipe, and the rated torque and the speed unit with the"
+                " drive; then run it again",
+                MessageCode.STRING_IMPEDANCE_DIFFERS,
+            ))
     if result.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if result.by_model else finding.words
         return replace(finding, inertia=result.inertia, budget=result.budget, words=words)
@@ -612,18 +621,6 @@ def _stands(chosen: Chosen, result: CompliantResult, case: PeriodicCase, rigid: 
 
 def _bounded(total: Estimate | None) -> bool:
     return total is not None and total.bounded
-
-
-def _pipe_contradiction(ratio: float) -> Refusal:
-    least, most = _PIPE_RATIOS
-    return Refusal(
-        f"the string has {ratio:.2f} times the characteristic impedance of the pipe in rig.yaml (limits {least:g} to"
-        f" {most:g}), and its travel time is that of the pipe: the scale of torque or speed is wrong by this factor, or"
-        " the pipe's diameters are",
-        "compare the diameters in rig.yaml with the pipe, and the rated torque and the speed unit with the drive; then"
-        " run it again",
-        MessageCode.STRING_IMPEDANCE_DIFFERS,
-    )
 
 
 def name_of(fit: CompliantFit, asked: str) -> str:

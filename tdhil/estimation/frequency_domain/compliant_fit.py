@@ -367,21 +367,17 @@ def fit_compliant(
     problem = Likelihood(lines, model, constraint, priors)
     starts = compliant_starts(problem, fixed)
     if near is not None:
-        starts = [*(_heavier(near.fitted.simple.theta, share) for share in _HEAVIER), *starts]
+        # Two masses fit J_L (1 − η/3) as J_L, and J_r + η J_L/3 as J_r: a third of a spring with the share η of the
+        # load's inertia seems to turn with the motor.
+        two, strings = near.fitted.simple.theta, []
+        for share in _HEAVIER:
+            theta = np.insert(two, STRING_SHARE, [share, 0.5])
+            theta[LOAD] = two[LOAD] / (1.0 - share / 3.0)
+            theta[INERTIA] = max(two[INERTIA] - share / 3.0 * theta[LOAD], 0.1 * two[INERTIA])
+            strings.append(theta)
+        starts = [*strings, *starts]
     fitted = fit_model(problem, fixed, starts, apart=too_slow(problem))
     return CompliantFit(fitted, residual_of(fitted))
-
-
-def _heavier(two: FloatArray, share: float) -> FloatArray:
-    """Return two masses with a spring of this share of the load's inertia, a third of which seemed to turn with the
-    motor.
-
-    Two masses fit J_L (1 − η/3) as J_L, and J_r + η J_L/3 as J_r.
-    """
-    theta = np.insert(two, STRING_SHARE, [share, 0.5])
-    theta[LOAD] = two[LOAD] / (1.0 - share / 3.0)
-    theta[INERTIA] = max(two[INERTIA] - share / 3.0 * theta[LOAD], 0.1 * two[INERTIA])
-    return theta
 
 
 def too_slow(problem: Likelihood) -> Apart:
