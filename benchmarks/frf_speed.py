@@ -22,7 +22,7 @@ from benchmarks.identify_speed import best_s, fit_s, synthesised
 from tdhil.estimation import Options, identify
 from tdhil.estimation.case import Case
 from tdhil.estimation.frequency_domain import measure_response
-from tdhil.estimation.identification import _sampled
+from tdhil.estimation.identification import sampled
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
 
 MOST_SHARE = 0.1         # of the identification
@@ -35,7 +35,7 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=1000.0)
     asked = parser.parse_args()
     recording = synthesised(asked.hours, asked.rate)
-    case = _sampled(Case(recording, Options()))
+    case = sampled(Case(recording, Options()))
     periodic = clear_lines(measured(case, recording.excitation))
     finding = identify_lines(periodic)
     alone = best_s(lambda: measure_response(periodic, finding.curve, finding.settled, finding.model), 3)

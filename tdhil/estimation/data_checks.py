@@ -1,8 +1,8 @@
 """Checks that refuse unusable data before any fit. Each refusal states the fault and the remedy.
 
-The order: usable samples (`check_samples`); a possible excitation that was sampled fast enough (`check_declared`);
-motion; no limit that shaped the motion (`check_limited`). Checks that need the spectral lines (wrong period, wrong
-sign, standstill) follow in `excitation_checks`.
+The order: usable samples (`check_samples`) and other data (`check_known`); a possible excitation that was sampled fast
+enough (`check_declared`); motion; no limit that shaped the motion (`check_limited`). Checks that need the spectral
+lines (wrong period, wrong sign, standstill) follow in `excitation_checks`.
 """
 
 import math
@@ -162,7 +162,23 @@ def check_declared(excitation: Excitation, samples: Samples) -> None:
             entry=MessageCode.EXCITATION_MISDECLARED,
         )
     for segment, part in zip(excitation.segments, inside, strict=True):
-        _check_rate(segment, part)
+        interval = usual_interval(part.time_s)
+        fastest = max(segment.lines_hz)
+        if len(part) < 2 or not np.isfinite(interval):
+            continue
+        if aliased(fastest, interval):
+            slow = fastest * interval > _SECONDS_NOT
+            raise Refused(
+                f"aliased: at one sample every {interval:.3g} s, a line at {fastest:g} Hz looks like a slower one",
+                "check the unit of the time stamps" if slow else
+                f"sample at {math.ceil(fastest / SAMPLED_SHARE):d} Hz or faster, or excite with lower lines",
+                entry=MessageCode.TOO_FEW_SAMPLES,
+            )
+        if too_few_a_period(len(segment.lines_hz), segment.period_s, interval):
+            raise Refused(
+                f"{segment.period_s / interval:.0f} samples a period are too few for {len(segment.lines_hz)} lines",
+                "sample faster, or excite with fewer lines", entry=MessageCode.TOO_FEW_SAMPLES,
+            )
 
 
 def _check_segment(segment: Segment, name: str) -> None:
@@ -186,26 +202,6 @@ def _check_segment(segment: Segment, name: str) -> None:
     if len(set(whole)) < len(whole):
         raise Refused(f"{name}: it declares the same line twice", "declare each line once",
                       entry=MessageCode.EXCITATION_MISDECLARED)
-
-
-def _check_rate(segment: Segment, part: Samples) -> None:
-    interval = usual_interval(part.time_s)
-    fastest = max(segment.lines_hz)
-    if len(part) < 2 or not np.isfinite(interval):
-        return
-    if aliased(fastest, interval):
-        slow = fastest * interval > _SECONDS_NOT
-        raise Refused(
-            f"aliased: at one sample every {interval:.3g} s, a line at {fastest:g} Hz looks like a slower one",
-            "check the unit of the time stamps" if slow else
-            f"sample at {math.ceil(fastest / SAMPLED_SHARE):d} Hz or faster, or excite with lower lines",
-            entry=MessageCode.TOO_FEW_SAMPLES,
-        )
-    if too_few_a_period(len(segment.lines_hz), segment.period_s, interval):
-        raise Refused(
-            f"{segment.period_s / interval:.0f} samples a period are too few for {len(segment.lines_hz)} lines",
-            "sample faster, or excite with fewer lines", entry=MessageCode.TOO_FEW_SAMPLES,
-        )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -262,10 +258,9 @@ def check_samples(recording: Recording) -> None:
         if largest > _HUGE:
             raise Refused(f"the {name} reaches {largest:.2g}, which no machine does", "look for a decoding fault",
                           entry=MessageCode.DATA_UNUSABLE)
-    _check_known(recording)
 
 
-def _check_known(recording: Recording) -> None:
+def check_known(recording: Recording) -> None:
     """Raise Refused for invalid data of the recording other than its samples."""
     prior = recording.lag_prior
     lags = [lag for lag in (prior.speed_lag_s, prior.torque_lag_s) if lag is not None]

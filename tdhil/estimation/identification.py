@@ -20,7 +20,7 @@ from tdhil.estimation.cross_checks import (
     torques_compared,
     torques_judged,
 )
-from tdhil.estimation.data_checks import check_samples
+from tdhil.estimation.data_checks import check_known, check_samples
 from tdhil.estimation.frequency_domain import measure_response
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
@@ -36,7 +36,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     """Identify the inertia. Never raises: it refuses. On one machine the same recording gives the same bits."""
     case = Case(before_abort(recording), options or Options(), aborted_stage(recording))
     try:
-        case = torques_compared(_sampled(case))
+        case = torques_compared(sampled(case))
         case = torques_judged(case)
         excitation = case.recording.excitation
         if excitation is None or not excitation.segments:
@@ -81,13 +81,14 @@ def _again(case: Case, excitation: Excitation, samples: Samples) -> tuple[Period
     return found, identify_lines(found)
 
 
-def _sampled(case: Case) -> Case:
+def sampled(case: Case) -> Case:
     """Return the case with its samples and the result of the paper's method, after settling (all samples without
     excitation).
 
     Raises Refused for unusable samples.
     """
     check_samples(case.recording)
+    check_known(case.recording)
     samples = usable_samples(case.recording)
     parts = [samples]
     if case.recording.excitation is not None and case.recording.excitation.segments:
