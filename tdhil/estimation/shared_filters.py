@@ -54,6 +54,8 @@ def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
 
     Only for complete runs that `identify` found rigid; this is not checked again.
     """
+    from scipy.special import chdtrc
+
     fits = [_fitted(recording) for recording in recordings]
     problems = [one.problem for one in fits]
     fixed = fits[0].fixed
@@ -101,12 +103,15 @@ def identify_together(recordings: Sequence[Recording]) -> FittedTogether:
     with_known = _inverse(whole, list(range(start_index)))
     # All J are free and come before every filter: their places are the same in theta and in both inverses.
     shares = _shares(inverse[index[-1]] - inverse[index[0]] if number > 1 else inverse[index[0]], inverse, parts, every)
-    rise = WHOLE_RUNS * _rise_by_weights(shares)
+    rise = WHOLE_RUNS * rise_by_weights(shares)
+    sharing, more = None, (size - len(fixed)) * (number - 1)
+    if more > 0:
+        statistic = max(best.objective - sum(one.whole.objective for one in fits), 0.0) / _excess(fits)
+        sharing = ResidualTest(statistic, float(more), float(chdtrc(more, statistic)))
     return FittedTogether(
         inertia_kg_m2=best.theta[index], covariance=inverse[np.ix_(index, index)] * rise,
-        degrees_of_freedom=_satterthwaite(shares), viscous_nm_s_rad=best.theta[1:start_index:_OWN],
-        sharing=_sharing(best.objective, [one.whole.objective for one in fits], _excess(fits),
-                         (size - len(fixed)) * (number - 1)),
+        degrees_of_freedom=satterthwaite(shares), viscous_nm_s_rad=best.theta[1:start_index:_OWN],
+        sharing=sharing,
         alone_kg_m2=np.array([one.likelier.theta[0] for one in fits]),
         covariance_known_filters=with_known[np.ix_(index, index)] * rise,
     )
@@ -173,14 +178,14 @@ def _shares(
     return found
 
 
-def _satterthwaite(shares: list[_Share]) -> float:
+def satterthwaite(shares: list[_Share]) -> float:
     """Return the degrees of freedom of the difference of the last and the first J."""
     variance = sum(one.variance for one in shares)
     uncertain = sum(one.variance**2 / one.dof for one in shares)
     return max(2.0, min(variance**2 / uncertain, 1e6)) if uncertain > 0.0 else 1e6
 
 
-def _rise_by_weights(shares: list[_Share]) -> float:
+def rise_by_weights(shares: list[_Share]) -> float:
     """Return the factor by which the variance of the difference exceeds rᵀ F r, since the weights are estimates.
 
     Kenward and Roger (Biometrics 53, 1997): with a weight of n degrees of freedom for the part F_k of F, the variance
@@ -213,12 +218,3 @@ def _excess(fits: Sequence[FittedModel]) -> float:
     """
     nu = min(float(np.median(one.problem.nu)) for one in fits)
     return 1.0 + fits[0].problem.model.size / (_LEANING * max(nu, 1.0))
-
-
-def _sharing(together: float, apart: list[float], rise: float, more: int) -> ResidualTest | None:
-    from scipy.special import chdtrc
-
-    if more <= 0:
-        return None
-    statistic = max(together - sum(apart), 0.0) / rise
-    return ResidualTest(statistic, float(more), float(chdtrc(more, statistic)))

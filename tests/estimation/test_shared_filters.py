@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tdhil.estimation.shared_filters import _inverse, _rise_by_weights, _satterthwaite, _shares
+from tdhil.estimation.shared_filters import _inverse, _shares, rise_by_weights, satterthwaite
 
 DOF = [(4.0, 4.0), (6.0, 12.0, 30.0), (3.0, 18.0, 18.0, 18.0)]
 LINES, RUNS = 20, 40_000
@@ -25,7 +25,7 @@ def test_the_rise_is_half_of_meier_s_for_a_weighted_mean(dof):
     """Meier (Biometrics 9, 1953): (1/W)(1 + 4 Σ p (1 − p)/n), p = w/W. `Likelihood.information` has the other half."""
     weights = np.arange(1.0, len(dof) + 1.0)
     share = weights / weights.sum()
-    assert _rise_by_weights(shares_of(weights, dof)) == pytest.approx(1.0 + 2.0 * np.sum(share * (1.0 - share) / dof))
+    assert rise_by_weights(shares_of(weights, dof)) == pytest.approx(1.0 + 2.0 * np.sum(share * (1.0 - share) / dof))
 
 
 @pytest.mark.parametrize("nu", [6.0, 10.0, 20.0])
@@ -40,10 +40,10 @@ def test_the_stated_variance_is_that_of_a_mean_with_estimated_weights(nu):
     variances = true_sd**2 * rng.chisquare(dof, size=(RUNS, LINES)) / dof
     weights = (nu - 1.0) / nu / variances
     estimates = (weights * values).sum(axis=1) / weights.sum(axis=1)
-    stated = [_rise_by_weights(shares_of(one, dof)) / one.sum() for one in weights[:2000]]
+    stated = [rise_by_weights(shares_of(one, dof)) / one.sum() for one in weights[:2000]]
     assert np.mean(stated) / np.var(estimates) == pytest.approx(1.0, abs=0.05)
 
 
 def test_one_line_alone_has_its_own_degrees_of_freedom_and_no_rise():
     shares = shares_of([2.0], [7.0])
-    assert _satterthwaite(shares) == pytest.approx(7.0) and _rise_by_weights(shares) == pytest.approx(1.0)
+    assert satterthwaite(shares) == pytest.approx(7.0) and rise_by_weights(shares) == pytest.approx(1.0)

@@ -11,7 +11,7 @@ from tdhil.estimation.conclude import conclude
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import usable_samples
 from tdhil.estimation.time_domain.fit import search
-from tdhil.estimation.time_domain.identify import _finding
+from tdhil.estimation.time_domain.identify import finding_of
 from tdhil.estimation.time_domain.solve import Solved, local_test
 from tdhil.estimation.time_domain.stick_slip import find_stick_slip
 from tdhil.estimation.time_domain.windows import joined, measure, place_windows, runs, thinned
@@ -80,13 +80,13 @@ def case():
 
 def test_an_answer_that_could_not_be_tested_is_none():
     with pytest.raises(Refused, match="too few frequencies to test the model"):
-        _finding(solved(None), case())
+        finding_of(solved(None), case())
 
 
 @pytest.mark.parametrize(("p_value", "stands"), [(0.0034, False), (0.0099, False), (0.011, True)])
 def test_an_answer_whose_residual_test_fails_at_one_percent_is_none(p_value, stands):
     one = case()
-    found = conclude(one, _finding(solved(ResidualTest(3.0, 5.0, p_value)), one))
+    found = conclude(one, finding_of(solved(ResidualTest(3.0, 5.0, p_value)), one))
     assert (found.inertia is not None) == stands
     assert (found.verdict is Verdict.MODEL_REJECTED) == (not stands)
 

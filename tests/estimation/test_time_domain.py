@@ -207,7 +207,7 @@ def test_the_interval_joins_that_of_one_pole_filters_in_each_band(monkeypatch, b
 
     apart = replace(narrow, fit=_shifted(narrow.fit, by))
     alone = solved(wide)
-    near = min(solving._one_pole_reach(apart, placed, 0.95), 0.5 * (alone.high - alone.low))
+    near = min(solving.one_pole_reach(apart, placed, 0.95), 0.5 * (alone.high - alone.low))
     joined = solved(wide, apart)
     assert holds(joined, apart.fit.theta[0], near)
     assert joined.high - joined.low > alone.high - alone.low
@@ -216,7 +216,7 @@ def test_the_interval_joins_that_of_one_pole_filters_in_each_band(monkeypatch, b
         _shifted(near, structured), objective=near.objective - 40.0))
     monkeypatch.setattr(solving, "profile", lambda problem, best, *_: Estimate(
         *(float(best.theta[0]) * share for share in (1.0, 0.993, 1.007))))
-    near = min(solving._one_pole_reach(wide, placed, 0.95), 0.007 * structured * float(wide.fit.theta[0]))
+    near = min(solving.one_pole_reach(wide, placed, 0.95), 0.007 * structured * float(wide.fit.theta[0]))
     assert holds(solved(wide), wide.fit.theta[0], near)
 
 

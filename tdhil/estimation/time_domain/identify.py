@@ -192,7 +192,7 @@ def identify_record(case: Case) -> Finding:
         refuse_open(few, found)
     inside = sum(run.length_s for run in found) / float(few.time_s[-1] - few.time_s[0])
     used = min(case.samples_used, round(inside * case.samples_used))
-    finding = _finding(solved, case)
+    finding = finding_of(solved, case)
     return replace(finding, conditions=(*finding.conditions, *conditions), samples_used=used)
 
 
@@ -238,7 +238,8 @@ def _is_open(inertia: Estimate) -> bool:
     return not inertia.bounded or inertia.low <= 0.0
 
 
-def _finding(solved: Solved, case: Case) -> Finding:
+def finding_of(solved: Solved, case: Case) -> Finding:
+    """Return the finding of a solved recording. Raises Refused if it has no residual test."""
     most = max(solved.budget, key=lambda line: line.half_width_kg_m2).source if solved.budget else ""
     words = ModelWords(
         "a rigid shaft with reporting lags",

@@ -402,7 +402,7 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
     chosen, value, bent = frictions.chosen, frictions.inertia, frictions.bent
     for band in narrower:
         middle = float(band.fit.theta[INERTIA])
-        near = min(_one_pole_reach(band, now.placed, confidence), 0.5 * (value.high - value.low))
+        near = min(one_pole_reach(band, now.placed, confidence), 0.5 * (value.high - value.low))
         value = _joined(value, middle - near, middle + near)
     problem = chosen.problem
     residual = local_test(problem, chosen.fit.theta, chosen.spread.factor)
@@ -452,7 +452,7 @@ def _shaft(
     return ShaftEquation(open_problem if shaped else problem, best if shaped else fit, scores, own, inertia, shaped)
 
 
-def _one_pole_reach(found: FoundFit, placed: tuple[TaperWindow, ...], confidence: float) -> float:
+def one_pole_reach(found: FoundFit, placed: tuple[TaperWindow, ...], confidence: float) -> float:
     """Return the half-width of J in one band, by the quadratic approximation, with one pole each."""
     own = spread(found.problem, found.fit, block_scores(found.problem, placed, found.fit.theta), INERTIA, confidence)
     return own.factor * own.quantile * own.sd

@@ -13,7 +13,6 @@ import numpy as np
 from profiles import MessageCode
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples
-from tdhil.recording import FloatArray
 
 _STILL_SHARE = 0.02       # of the highest speed: a lower speed counts as standstill
 _STILL_QUANTA = 3.0       # resolution steps of the reported speed: a lower speed also counts as standstill
@@ -75,19 +74,14 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
         before = speed[int(stops[-1]) + 1 if len(stops) else 0 : first]
         if way != (float(np.sign(before[np.argmax(np.abs(before))])) if len(before) else 0.0):
             continue      # a speed loop that reverses the shaft also integrates at standstill, for a moment
-        rise = _rise(samples.time_s[first:last], way * torque[first:last])
+        # the rise of torque over the standstill after the reports settled, N·m, if it is steady
+        begun = first + int(_SETTLED * (last - first))
+        time_s, pull = samples.time_s[begun:last] - samples.time_s[begun], way * torque[begun:last]
+        if np.ptp(pull) == 0.0 or np.corrcoef(time_s, pull)[0, 1] < _STEADY:
+            continue
+        rise = float(np.polyfit(time_s, pull, 1)[0]) * float(time_s[-1])
         if rise > max(_LEAST_RISE * span, 2.0 * torque_quantum):
             rises.append(rise)
     if len(rises) < _LEAST_JUMPS or len(rises) < _MOST_JUMPS_APART * between:
         return None
     return StickSlip(len(rises), float(np.mean(still)), float(np.median(rises)))
-
-
-def _rise(time: FloatArray, torque: FloatArray) -> float:
-    """Return the rise of torque over a standstill after the reports settled, N·m; 0 if it is not steady."""
-    begun = int(_SETTLED * len(time))
-    time, torque = time[begun:] - time[begun], torque[begun:]
-    if np.ptp(torque) == 0.0 or np.corrcoef(time, torque)[0, 1] < _STEADY:
-        return 0.0
-    slope = float(np.polyfit(time, torque, 1)[0])
-    return slope * float(time[-1])
