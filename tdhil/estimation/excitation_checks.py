@@ -259,7 +259,13 @@ def strongest_undeclared(stretch: Stretch, fit: PeriodLines, name: str) -> tuple
     amplitude = 2.0 * np.sqrt(power) / filled
     least = np.where(hertz > max(fit.lines_hz), _STRONG, _STRONG_AMONG) * declared
     strong = np.flatnonzero(candidates & (amplitude > least))
-    clear = [int(k) for k in strong if power[k] > _CLEAR_UNDECLARED * _neighbourhood(power, int(k))]
+    clear = []
+    for k in strong.tolist():
+        # the median of the bins on one side, without the two nearest: the greater side, as noise rises at low ones
+        sides = power[max(k - 2 - _NEIGHBOURS, 1) : max(k - 2, 1)], power[k + 3 : k + 3 + _NEIGHBOURS]
+        noise = max((float(np.median(side)) for side in sides if len(side) >= _FEWEST), default=float("inf"))
+        if power[k] > _CLEAR_UNDECLARED * noise:
+            clear.append(k)
     if not clear:
         return None
     best = max(clear, key=lambda k: float(power[k]))
@@ -291,15 +297,6 @@ def _averaged(
     turned = np.exp(2j * np.pi * np.multiply.outer(when[full], np.asarray(lines_hz)))
     value[full] -= (turned @ lines).real
     return value, full
-
-
-def _neighbourhood(power: FloatArray, at: int) -> float:
-    """Return the median of the bins on one side of a bin, without its two nearest: the greater side, as noise rises
-    at low ones.
-    """
-    low = power[max(at - 2 - _NEIGHBOURS, 1) : max(at - 2, 1)]
-    high = power[at + 3 : at + 3 + _NEIGHBOURS]
-    return max((float(np.median(side)) for side in (low, high) if len(side) >= _FEWEST), default=float("inf"))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -69,6 +69,8 @@ def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDr
     """Return the drift. ``times``: middles of each segment's periods (P,), s. ``torques``: mean torque less J·dω/dt
     (P,), N·m.
     """
+    from scipy.special import ndtri, stdtr
+
     none = FrictionDrift(own=(0.0,) * len(times))
     dof = sum(max(len(time) - 2, 0) for time in times)
     centred = [(time - time.mean(), torque - torque.mean()) for time, torque in zip(times, torques, strict=True)]
@@ -79,7 +81,10 @@ def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDr
     own = [float(t @ y) / power if (power := float(t @ t)) > 0.0 else trend for t, y in centred]
     variance = sum(float(np.sum((y - c * t) ** 2)) for c, (t, y) in zip(own, centred, strict=True)) / dof
     sd = float(np.sqrt(variance / lever))
-    deviations = _deviations(trend, sd, dof)
+    # standard deviations of a normal distribution with the same probability as this trend by Student's t
+    deviations = 0.0 if sd <= 0.0 and trend == 0.0 else np.inf
+    if sd > 0.0 and (tail := float(stdtr(dof, -abs(trend) / sd))) > 0.0:
+        deviations = float(-ndtri(tail))
     share = min(max((deviations - _NONE) / (_ALL - _NONE), 0.0), 1.0)
     if share == 0.0:
         return none
@@ -104,18 +109,6 @@ def warming_warning(warming: FrictionDrift) -> tuple[str, ...]:
         "friction, or a drifting torque zero). The interval allows for this. Warm the machine up first",
         MessageCode.FRICTION_DRIFTS,
     ),)
-
-
-def _deviations(trend: float, sd: float, dof: int) -> float:
-    """Return the standard deviations of a normal distribution with the same probability as this trend by Student's
-    t.
-    """
-    from scipy.special import ndtri, stdtr
-
-    if sd <= 0.0:
-        return 0.0 if trend == 0.0 else np.inf
-    tail = float(stdtr(dof, -abs(trend) / sd))
-    return float(-ndtri(tail)) if tail > 0.0 else np.inf
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -183,7 +176,11 @@ def measure_levels(
             length = stretch.segment.period_s
             means = (fit.speed_mean.mean(), fit.torque_mean.mean(), drift.mean())
             rows.append((*means, length * len(drift), times[-1].mean()))
-    warming = _warming(times, errors)
+    # the drift from the segments that have periods; the other segments get the mean rate
+    fixed = [number for number, error in enumerate(errors) if len(error)]
+    warming = warming_of([times[number] for number in fixed], [errors[number][:, 1] for number in fixed])
+    own = dict(zip(fixed, warming.own, strict=True))
+    warming = replace(warming, own=tuple(own.get(number, warming.rate) for number in range(len(errors))))
     if not _span_enough(rows):
         rows += [row for level in steady if (row := _steady_row(samples.between(level.start_s, level.end_s)))]
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
@@ -201,14 +198,6 @@ def measure_levels(
             scatter += float(np.sum((left - left.mean()) ** 2))
     density = length * scatter / dof if dof > 0.0 else 0.0
     return Levels(table[:, 0], table[:, 1], table[:, 2], table[:, 3], density, dof, time, warming)
-
-
-def _warming(times: list[FloatArray], errors: list[FloatArray]) -> FrictionDrift:
-    """Return the drift from the segments that have periods; the other segments get the mean rate."""
-    fixed = [number for number, error in enumerate(errors) if len(error)]
-    found = warming_of([times[number] for number in fixed], [errors[number][:, 1] for number in fixed])
-    own = dict(zip(fixed, found.own, strict=True))
-    return replace(found, own=tuple(own.get(number, found.rate) for number in range(len(errors))))
 
 
 def tie_viscous(levels: Levels) -> ViscousConstraint | None:

@@ -10,7 +10,7 @@ J. At the raw rate (difference of neighbouring samples, torque of the later one)
 the slope by 1 + var(noise of α)/var(α): it depends on the sampling rate, and becomes far too small.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -28,7 +28,10 @@ Pairs = tuple[FloatArray, FloatArray]
 
 def paper_estimate(parts: tuple[Samples, ...]) -> PaperEstimate | None:
     """Return both fits over all parts together; None if the speed never changes or there are too few steps."""
-    first, second = _fit_blocks(map(_steps, parts)), _fit_blocks(_raw(parts))
+    # block by block, the backward difference of the speed with the torque at the end of the interval
+    raw = ((np.diff(part.speed_rad_s[block]) / np.diff(part.time_s[block]), part.torque_nm[block][1:])
+           for part in parts for block in (slice(k, k + _BLOCK + 1) for k in range(0, len(part) - 1, _BLOCK)))
+    first, second = _fit_blocks(map(_steps, parts)), _fit_blocks(raw)
     return None if first is None or second is None else PaperEstimate(stepped=first, raw_rate=second)
 
 
@@ -102,12 +105,3 @@ def _impulse(part: Samples) -> FloatArray:
         mean = 0.5 * (torque[first + 1 : last + 1] + torque[first:last])
         total[first + 1 : last + 1] = mean * np.diff(time[first : last + 1])
     return np.cumsum(total, out=total)
-
-
-def _raw(parts: tuple[Samples, ...]) -> Iterator[Pairs]:
-    """Yield, block by block, the backward difference of the speed with the torque at the end of the interval."""
-    for part in parts:
-        for first in range(0, len(part) - 1, _BLOCK):
-            block = slice(first, first + _BLOCK + 1)
-            time, speed = part.time_s[block], part.speed_rad_s[block]
-            yield np.diff(speed) / np.diff(time), part.torque_nm[block][1:]
