@@ -305,19 +305,14 @@ def _fitted(drive: TorqueRecord, sensor: TorqueRecord, offset_s: float, width_s:
         shift = float(np.clip(shift - step_s, -0.4 * margin, 0.4 * margin))
         if abs(step_s) < _CLOSE * width_s:
             break
-    ratio = _noise_ratio(drive, sensor)
-    return _line(points, x, y, others, ratio, offset_s + shift, width_s)
-
-
-def _noise_ratio(drive: TorqueRecord, sensor: TorqueRecord) -> float:
-    """Return the variance of the sensor's average over that of the drive's, from second differences of the samples."""
+    # variance of the sensor's average over that of the drive's, from second differences of the samples
     power = []
     for one in (sensor, drive):
-        second = np.diff(one.torque_nm, 2)
-        sd = max(float(np.median(np.abs(second))) / 0.6745 / math.sqrt(6.0), one.count_nm / math.sqrt(12.0))
+        sd = max(float(np.median(np.abs(np.diff(one.torque_nm, 2)))) / 0.6745 / math.sqrt(6.0),
+                 one.count_nm / math.sqrt(12.0))
         power.append(sd**2 * _slowest(one))
-    low, high = _ALIKE
-    return float(np.clip(power[0] / power[1], low, high)) if power[1] > 0.0 and power[0] > 0.0 else 1.0
+    ratio = float(np.clip(power[0] / power[1], *_ALIKE)) if power[1] > 0.0 and power[0] > 0.0 else 1.0
+    return _line(points, x, y, others, ratio, offset_s + shift, width_s)
 
 
 def _line(

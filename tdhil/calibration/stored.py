@@ -49,10 +49,10 @@ class StoredCalibration:
         factor = document.get("calibration_factor")
         if not isinstance(factor, Mapping):
             raise CalibrationUnusable("holds no calibration factor: that calibration was refused")
-        numbers = [factor.get(name) for name in _NUMBERS]
-        if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
+        numbers = _numbers_in(factor)
+        if not numbers:
             raise CalibrationUnusable("holds a calibration factor that is no number")
-        value, low, high, confidence = (float(one) for one in numbers if isinstance(one, int | float))
+        value, low, high, confidence = numbers
         if not (_LEAST <= low <= value <= high <= _MOST and 0.5 <= confidence < 1.0):
             raise CalibrationUnusable(f"holds a calibration factor that can't be: {value:g} ({low:g} to {high:g})")
         date = document.get("date")
@@ -63,8 +63,12 @@ class StoredCalibration:
         drive, settings = (document.get(name) or {} for name in ("drive", "settings"))
         if not isinstance(drive, Mapping) or not isinstance(settings, Mapping):
             raise CalibrationUnusable("names no drive")
+        own_rel_sd, inertia = 0.0, document.get("inertia_kg_m2")
+        if document.get(OWN_LOG) is True and isinstance(inertia, Mapping) and (own := _numbers_in(inertia)) and (
+                0.0 < own[1] <= own[0] <= own[2] and 0.5 <= own[3] < 1.0):
+            own_rel_sd = 0.5 * (own[2] - own[1]) / own[0] / normal_quantile(own[3])
         return cls(value, low, high, confidence, str(date), dict(drive), dict(settings),
-                   document.get("simulated") is True, _own_rel_sd(document))
+                   document.get("simulated") is True, own_rel_sd)
 
     @property
     def day(self) -> str:
@@ -121,19 +125,6 @@ class StoredCalibration:
         )
 
 
-def _own_rel_sd(document: Mapping[str, Any]) -> float:
-    inertia = document.get("inertia_kg_m2")
-    if document.get(OWN_LOG) is not True or not isinstance(inertia, Mapping):
-        return 0.0
-    numbers = [inertia.get(name) for name in _NUMBERS]
-    if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
-        return 0.0
-    value, low, high, confidence = (float(one) for one in numbers if isinstance(one, int | float))
-    if not (0.0 < low <= value <= high and 0.5 <= confidence < 1.0):
-        return 0.0
-    return 0.5 * (high - low) / value / normal_quantile(confidence)
-
-
 def _scaled(signal: FloatArray | None, factor: float) -> FloatArray | None:
     return None if signal is None else factor * signal
 
@@ -144,3 +135,11 @@ def _differ(a: Any, b: Any) -> bool:
     if isinstance(a, int | float) and isinstance(b, int | float):
         return abs(a - b) > _ALIKE * max(abs(a), abs(b))
     return bool(a != b)
+
+
+def _numbers_in(stated: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return value, low, high and confidence; () if one of them is missing or no finite number."""
+    numbers = [stated.get(name) for name in _NUMBERS]
+    if not all(isinstance(one, int | float) and math.isfinite(one) for one in numbers):
+        return ()
+    return tuple(float(one) for one in numbers if isinstance(one, int | float))
