@@ -190,18 +190,6 @@ def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _
                     float(np.median(torque_noise)), float(np.mean(means)))
 
 
-def _carried_down(string: DrillString, s: ComplexArray, speed: ComplexArray, torque: ComplexArray
-                  ) -> tuple[ComplexArray, ComplexArray]:
-    """Return (speed, torque) at the lower end of the last line for those at the top.
-
-    The matrix of a line from its lower to its upper end has the determinant 1. Its inverse has the same diagonal, and
-    the other elements with the other sign, which are those of a line of negative length.
-    """
-    down = replace(string, lines=tuple(replace(line, length_m=-line.length_m) for line in reversed(string.lines)))
-    found = down.carried_up(s, speed, torque)
-    return np.asarray(found[0]), np.asarray(found[1])
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Fit.
 
@@ -228,9 +216,13 @@ def _fitted(
     none: ComplexArray = np.zeros(len(s), dtype=np.complex128)
     load = s * string.bottom_inertia_kg_m2 + string.bottom_viscous_nm_s_rad + _slope(string.bit, spectra.mean_rad_s)
 
+    # The matrix of a line from its lower to its upper end has the determinant 1. Its inverse has the same diagonal, and
+    # the other elements with the other sign, which are those of a line of negative length.
+    down = replace(string, lines=tuple(replace(line, length_m=-line.length_m) for line in reversed(string.lines)))
+
     def at_bit(speed: ComplexArray, torque: ComplexArray) -> ComplexArray:
-        below = _carried_down(string, s, speed, torque)
-        found: ComplexArray = below[1] - load * below[0]
+        speed_below, torque_below = (np.asarray(one) for one in down.carried_up(s, speed, torque))
+        found: ComplexArray = torque_below - load * speed_below
         return found
 
     per_torque = at_bit(none, (1.0 + s * record.torque_lag_s) * ones)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from math import inf, pi
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,8 +163,20 @@ def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
     backwards = ahead.min(axis=0) < -0.01 * window.highest_rad_s
     bearable = [k for k in range(len(below)) if top[:, k].min() > window.lowest_rad_s and not backwards[k]]
     if not bearable:
-        forward = [float(top[:, k].min()) for k in range(len(below)) if not backwards[k]]
-        _refuse_low(case, window, max(forward, default=0.0))
+        # the lowest speed at the best of the set speeds at which the bit shall stick; 0: at each of them the top is
+        # about to turn backwards
+        lowest_rad_s = max((float(top[:, k].min()) for k in range(len(below)) if not backwards[k]), default=0.0)
+        if lowest_rad_s <= 0.0:
+            raise EvaluationRefused(
+                f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is light beside this string "
+                f"and bit: with the {case.prediction.kind} controller it would be about to turn back before the bit "
+                "turns",
+                where="--use", next_step="Take a stiffer one; or tune for a heavier machine, with its own result, and "
+                "name this rig's by --result: the string's torques are scaled to it")
+        raise EvaluationRefused(
+            f"the top falls to {lowest_rad_s / ratio / RPM:.1f} rpm before the bit turns; this window begins at "
+            f"{window.lowest_rad_s / ratio / RPM:.1f} rpm", where="limits.speed_min_rad_s",
+            next_step=f"Set it to {0.95 * lowest_rad_s:.2g} rad/s or less, or take a stiffer controller (--use)")
     room = window.highest_rad_s - float(highest[-1]) + cure.high * RPM * ratio
     if room < (cure.high + TOLERANCE_RPM) * RPM * ratio:
         raise EvaluationRefused(
@@ -184,25 +196,6 @@ def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
     if case.own_loop:      # the drive's own loop has to balance the string's torque itself
         program = replace(program, fade_s=OWN_LOOP_FADE_S, armed_s=OWN_LOOP_ARMED_S, settle_s=OWN_LOOP_ARMED_S)
     return program
-
-
-def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) -> NoReturn:
-    """Raise EvaluationRefused: the top's speed drops too low at every set speed at which the bit shall stick.
-
-    ``lowest_rad_s``: lowest speed of the motor at the best of these set speeds. 0: at each of them the top is about to
-    turn backwards.
-    """
-    if lowest_rad_s <= 0.0:
-        raise EvaluationRefused(
-            f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is light beside this string and "
-            f"bit: with the {case.prediction.kind} controller it would be about to turn back before the bit turns",
-            where="--use", next_step="Take a stiffer one; or tune for a heavier machine, with its own result, and name "
-            "this rig's by --result: the string's torques are scaled to it")
-    raise EvaluationRefused(
-        f"the top falls to {lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm before the bit turns; this window "
-        f"begins at {window.lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm",
-        where="limits.speed_min_rad_s",
-        next_step=f"Set it to {0.95 * lowest_rad_s:.2g} rad/s or less, or take a stiffer controller (--use)")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -171,7 +171,11 @@ def loop_margins(
     loads = ((False, response.turning), (True, response.stuck))
     for is_stuck, load in loads if stuck else loads[:1]:
         loop = through / (rotor + load)
-        stable = stable and _encircles_nothing(loop)
+        # Nyquist criterion: rotor and string are passive, so L has no pole in the right half-plane, and the loop is
+        # stable if L does not encircle −1. The phase of 1 + L begins between −180° and 0, because L has at most one
+        # pole at the origin that is not balanced by losses. It ends at 0 if −1 is not encircled, otherwise at a
+        # multiple of 360°.
+        stable = stable and abs(float(np.unwrap(np.angle(1.0 + loop))[-1])) < 0.5 * pi
         found = _crossings(omega, loop)
         if exact:
             near = _refined(omega, np.log(np.abs(loop)))
@@ -192,17 +196,6 @@ def _refined(omega: Reals, size: Reals) -> Reals:
     between = omega[near, None] + (omega[near + 1] - omega[near])[:, None] * parts
     merged: Reals = np.sort(np.concatenate([omega, between.ravel()]))
     return merged
-
-
-def _encircles_nothing(loop: Complex) -> bool:
-    """Return whether L does not encircle −1 (Nyquist criterion).
-
-    Rotor and string are passive, so L has no pole in the right half-plane. The loop is stable if L does not encircle
-    −1. The phase of 1 + L begins between −180° and 0, because L has at most one pole at the origin that is not balanced
-    by losses. It ends at 0 if −1 is not encircled, otherwise at a multiple of 360°.
-    """
-    end = float(np.unwrap(np.angle(1.0 + loop))[-1])
-    return abs(end) < 0.5 * pi
 
 
 def is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> bool:

@@ -60,13 +60,6 @@ def _second_order(over: tuple[float, float, float], under: tuple[float, float]) 
     return a, np.array([0.0, omega]), np.array([(n0 - n2 * d0) / d0, (n1 - n2 * d1) / omega]), n2
 
 
-def _dead_time(seconds: float) -> _SYSTEM:
-    if seconds <= 0.0:
-        return _gain(1.0)
-    one, two = 6.0 / seconds, 12.0 / seconds**2
-    return _second_order((1.0, -one, two), (one, two))
-
-
 def _shaft(plant: LoopPlant) -> _SYSTEM:
     inertia, viscous = plant.inertia_kg_m2, plant.viscous_nm_s_rad
     if plant.spring is None:
@@ -89,7 +82,10 @@ def _controller(gains: PiGains) -> _SYSTEM:
 
 def closed_loop(plant: LoopPlant, gains: PiGains) -> tuple[Reals, Reals, Reals]:
     """Return A, B and C of the closed loop, from speed setpoint to the motor's speed."""
-    forward = _series(_controller(gains), _dead_time(plant.dead_time_s))
+    forward = _controller(gains)
+    if plant.dead_time_s > 0.0:
+        one, two = 6.0 / plant.dead_time_s, 12.0 / plant.dead_time_s**2
+        forward = _series(forward, _second_order((1.0, -one, two), (one, two)))
     for lag in plant.lags_s[1:]:
         forward = _series(forward, _lag(lag))
     forward = _series(forward, _shaft(plant))
