@@ -129,8 +129,17 @@ def write_study(outcome: StudyOutcome, settings: BaseModel, folder: Path) -> Wri
     own = _settings(outcome.name, settings, folder)
     if outcome.draw is None:
         return Written(folder, tables, own)
+    picture, vector = folder / f"{outcome.name}.png", folder / f"{outcome.name}.svg"
     try:
-        picture, vector = _pictures(outcome, folder)
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        with repeatable_figures():
+            figure = Figure(figsize=outcome.figure_size_in)
+            FigureCanvasAgg(figure)
+            outcome.draw(figure)
+            figure.savefig(picture, dpi=DPI)
+            figure.savefig(vector, metadata={"Date": None})     # so that the same outcome gives the same file
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "matplotlib":
             raise
@@ -177,21 +186,6 @@ def _settings(name: str, settings: BaseModel, folder: Path) -> Path:
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100)
     path.write_text(head + text, encoding="utf-8")
     return path
-
-
-def _pictures(outcome: StudyOutcome, folder: Path) -> tuple[Path, Path]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    assert outcome.draw is not None
-    png, svg = folder / f"{outcome.name}.png", folder / f"{outcome.name}.svg"
-    with repeatable_figures():
-        figure = Figure(figsize=outcome.figure_size_in)
-        FigureCanvasAgg(figure)
-        outcome.draw(figure)
-        figure.savefig(png, dpi=DPI)
-        figure.savefig(svg, metadata={"Date": None})     # so that the same outcome gives the same file
-    return png, svg
 
 
 def _plain(value: Any) -> Any:

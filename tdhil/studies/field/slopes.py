@@ -156,27 +156,16 @@ def said_of_slopes(
         "the fitted slope grows with the tone", "by 76 % from 0.1 to 1 Hz, on one rig", f"by {growth:.0%}, on one rig",
         bool(np.all(np.diff(ordered) > 0.0)),
     ))
-    return (*found, *_joint_statements(settings, joint, records, curve), *_open(records))
-
-
-def percent(ours: float, published: float | None) -> float | None:
-    """Return the deviation of ``ours`` in percent; None without a published value."""
-    return None if published is None else 100.0 * (ours / published - 1.0)
-
-
-def _joint_statements(
-    settings: SlopeSettings, joint: Identification, records: list[Record], curve: FloatArray | None
-) -> list[Statement]:
-    true = settings.rig.inertia_kg_m2
-    found = joint.inertia
+    true, one_inertia = settings.rig.inertia_kg_m2, joint.inertia
     text = "one inertia behind all records: the joint fit's interval covers the rig's"
-    if found is None or curve is None:
-        return [Statement(text, "none given", f"no number: {joint.reason}", False)]
-    value = f"{found.value:.2f} ({found.low:.2f} to {found.high:.2f}) kg·m² for {true:g}"
+    if one_inertia is None or curve is None:
+        return (*found, Statement(text, "none given", f"no number: {joint.reason}", False), *_open(records))
+    value = f"{one_inertia.value:.2f} ({one_inertia.low:.2f} to {one_inertia.high:.2f}) kg·m² for {true:g}"
     off = float(np.max(np.abs(curve / np.array([record.at_the_tone for record in records]) - 1.0)))
     noise = max(1.0 - record.points.fit.inertia_kg_m2 / record.at_the_tone for record in records)
-    return [
-        Statement(text, "no reference inertia is published", value, found.low <= true <= found.high),
+    return (
+        *found,
+        Statement(text, "no reference inertia is published", value, one_inertia.low <= true <= one_inertia.high),
         Statement(
             "one line, with that inertia and the reporting lags, passes through all slopes",
             "J 103.75, lags 0.403 and 0.151 s: 0.10 kg·m² RMS from the four",
@@ -184,7 +173,13 @@ def _joint_statements(
             f"α takes up to {noise:.1%} more off the fitted slopes",
             off <= CURVE_CLOSE,
         ),
-    ]
+        *_open(records),
+    )
+
+
+def percent(ours: float, published: float | None) -> float | None:
+    """Return the deviation of ``ours`` in percent; None without a published value."""
+    return None if published is None else 100.0 * (ours / published - 1.0)
 
 
 def _open(records: list[Record]) -> list[Statement]:
