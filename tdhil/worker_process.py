@@ -51,10 +51,15 @@ class WorkerProcess:
     def __init__(self, program: str, *, quiet: bool = False, yields: bool = False) -> None:
         if not sys.executable:
             raise FileNotFoundError("the path of the Python interpreter is unknown")
+        # keeps Ctrl-C from the process. It stays in the same session: across sessions nice values have no effect
+        own_group: dict[str, Any] = {"process_group": 0}
+        if sys.platform == "win32":
+            flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
+            own_group = {"creationflags": flags | (subprocess.BELOW_NORMAL_PRIORITY_CLASS if yields else 0)}
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", f"import sys; sys.path[:] = {sys.path!r}\n{program}"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL if quiet else None,
-            env=os.environ | ONE_THREAD, **_own_group(yields),
+            env=os.environ | ONE_THREAD, **own_group,
         )
         assert self._process.stdin is not None
         assert isinstance(self._process.stdout, io.BufferedReader)
@@ -133,14 +138,6 @@ def result_in(message: bytes) -> Any:
     return found
 
 
-def _own_group(yields: bool) -> dict[str, Any]:
-    """Keep Ctrl-C from the process. It stays in the same session: across sessions nice values have no effect."""
-    if sys.platform == "win32":
-        flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
-        return {"creationflags": flags | (subprocess.BELOW_NORMAL_PRIORITY_CLASS if yields else 0)}
-    return {"process_group": 0}
-
-
 def _send(stream: Any, message: bytes) -> None:
     stream.write(LENGTH.pack(len(message)) + message)
     stream.flush()
@@ -176,7 +173,15 @@ def serve(
                 _send(answers, _not_sent(f"{type(error).__name__}: {error}"))
                 continue
             if memory_bytes is not None:
-                _limit_memory(memory_bytes)
+                # Above the limit of the address space, Python raises MemoryError. A system may have no such limit.
+                with suppress(ImportError, OSError, ValueError):
+                    import resource
+
+                    with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
+                        now = int(file.read().split()[0]) * resource.getpagesize()
+                    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+                    wanted = now + memory_bytes
+                    resource.setrlimit(resource.RLIMIT_AS, (wanted if hard < 0 else min(wanted, hard), hard))
                 memory_bytes = None
             _send(answers, _answer(work, caught))
 
@@ -207,19 +212,3 @@ def _answer(work: Callable[[], Any], caught: type[BaseException]) -> bytes:
 
 def _not_sent(reason: str) -> bytes:
     return pickle.dumps(("not sent", pickle.dumps(reason)))
-
-
-def _limit_memory(memory_bytes: int) -> None:
-    """Limit the additional address space, bytes. Above the limit, Python raises MemoryError. Without effect if the
-    system has no such limit.
-    """
-    try:
-        import resource
-
-        with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
-            now = int(file.read().split()[0]) * resource.getpagesize()
-        _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        wanted = now + memory_bytes
-        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard < 0 else min(wanted, hard), hard))
-    except (ImportError, OSError, ValueError):
-        return

@@ -104,7 +104,11 @@ def make_evidence(
         write_copy(log, copy, found, edit=scrub.message, level=LEVEL)
         stored: Mapping[str, Any] = run.result or {}
         before = stored if stored.get("tdhil") == __version__ else conclude(log)
-        result = _equal_results(before, conclude(copy), str(log))
+        result = conclude(copy)
+        if _difference(before, result, _ALIKE):      # a number was a name
+            raise LogError(
+                "scrubbing would change the result: a setting of the log has the name of the operator or rig",
+                where=str(log), next_step="Report it with the archive of tdhil support")
         members = _members(copy, statement, result, __version__)
         leaks = [f"{name}: {' and '.join(kinds)}" for name, texts in _texts(members, copy)
                  if (kinds := leaks_in(texts))]
@@ -150,7 +154,13 @@ def check_evidence(archive: bytes, sha256: str = "", *, conclude: Conclude | Non
             problems += _problems_of_log(copy, rig_name="rig" in statement.publish)
             for name, texts in _texts(members, copy):
                 problems += [f"{name} contains this: {kind}" for kind in leaks_in(texts)]
-            problems += _problems_of_content(members, copy, statement, stated, version)
+            derived = _members(copy, statement, stated, version)
+            # another version may word the README anew
+            problems += [f"{name} does not follow from {LOG} and {STATEMENT}" for name in derived
+                         if members.get(name) != derived[name]
+                         and (version == __version__ or name not in (README, MANIFEST))]
+            if statement.simulated is not (stated.get("simulated") is True):
+                problems.append("the statement and the log differ on whether the drive is simulated")
             if version != __version__:
                 notes.append(f"made by tdhil {version}, checked by {__version__}: the result may differ by up to"
                              f" {OTHER_VERSION:.0%}")
@@ -207,14 +217,6 @@ def _members(log: Path, statement: PublisherStatement, result: Mapping[str, Any]
     return members_of(facts, log.read_bytes(), statement, result, version)
 
 
-def _equal_results(before: Mapping[str, Any], after: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return the result of the scrubbed log. Raises LogError if scrubbing changed it: a number was a name."""
-    if _difference(before, after, _ALIKE):
-        raise LogError("scrubbing would change the result: a setting of the log has the name of the operator or rig",
-                       where=where, next_step="Report it with the archive of tdhil support")
-    return after
-
-
 def _difference(stated: Mapping[str, Any], found: Mapping[str, Any], share: float) -> str:
     """Return how two results differ in verdict and J, in words; '' if they are equal within this share."""
     if stated.get("verdict") != found.get("verdict"):
@@ -244,18 +246,6 @@ def _problems_of_log(log: Path, *, rig_name: bool) -> Iterator[str]:
     scrub = LogScrub(found.run.configuration, rig_name=rig_name)
     if any(scrub.message(channel, payload) != payload for channel, payload in messages_of(log)):
         yield f"{LOG} has names, serial numbers or entries that an archive must not have"
-
-
-def _problems_of_content(
-    members: Mapping[str, bytes], log: Path, statement: PublisherStatement, stated: Mapping[str, Any], version: str
-) -> Iterator[str]:
-    """Yield which members do not follow from log, statement and result. Another version may word the README anew."""
-    derived = _members(log, statement, stated, version)
-    for name in derived:
-        if members.get(name) != derived[name] and (version == __version__ or name not in (README, MANIFEST)):
-            yield f"{name} does not follow from {LOG} and {STATEMENT}"
-    if statement.simulated is not (stated.get("simulated") is True):
-        yield "the statement and the log differ on whether the drive is simulated"
 
 
 def _texts(members: Mapping[str, bytes], log: Path) -> Iterator[tuple[str, Iterable[str]]]:
