@@ -147,7 +147,11 @@ class _Reader:
                 continue
             if line[0] == "[":
                 name, closed, _ = line[1:].partition("]")
-                name = _canonical(name.strip())
+                # in one spelling: 1016SUB1 and 1016Sub01 as 1016sub1, other names as in CiA 306
+                if match := _OBJECT.fullmatch(name := name.strip()):
+                    name = match[1].upper() + ("" if match[2] is None else f"sub{int(match[2], 16):X}")
+                else:
+                    name = _SECTIONS.get(name.lower(), name)
                 if not closed or not name:
                     self.refuse(number, "a section's name stands between [ and ]")
                 elif name in self._sections:
@@ -319,13 +323,6 @@ def _rank(name: str) -> int:
     if match := _OBJECT.fullmatch(name):
         return 1 if match[2] is None else 2
     return 3 if re.fullmatch(r"[0-9A-Fa-f]{4}Name", name) else 4
-
-
-def _canonical(name: str) -> str:
-    """Return the section's name in one spelling: 1016SUB1 and 1016Sub01 as 1016sub1, other names as in CiA 306."""
-    if match := _OBJECT.fullmatch(name):
-        return match[1].upper() + ("" if match[2] is None else f"sub{int(match[2], 16):X}")
-    return _SECTIONS.get(name.lower(), name)
 
 
 def _number(text: str, data_type: int) -> float:

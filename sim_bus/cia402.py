@@ -383,11 +383,11 @@ class Application:
             return False
         if self.state is not State.ENABLED or self.halted or self._after_stop is not None:
             return True
-        in_speed = self.mode in {OperationMode.VELOCITY, OperationMode.PROFILE_VELOCITY, OperationMode.CYCLIC_VELOCITY}
-        return in_speed and (self.target_speed_rad_s == 0.0 or self._ramped_down())
-
-    def _ramped_down(self) -> bool:
-        """Return whether the host lowers the speed setpoint along a straight line, as above a drill string."""
+        if self.mode not in {OperationMode.VELOCITY, OperationMode.PROFILE_VELOCITY, OperationMode.CYCLIC_VELOCITY}:
+            return False
+        if self.target_speed_rad_s == 0.0:
+            return True
+        # above a drill string the host lowers the speed setpoint along a straight line
         target, fall = abs(self.target_speed_rad_s), self._fall
         if fall and (target > fall[-1][1] or self._time_s - fall[-1][0] > RAMP_GAP_S):
             fall.clear()

@@ -150,6 +150,8 @@ def can_line(cli: Mapping[str, Any], rig: Rig | None = None) -> CanLine:
     Raises UsageError and DataFileError for an unusable value. A file or variable that names a bit rate but no
     interface leaves the bus unconfigured.
     """
+    from can.util import CONFIG_FILES
+
     settings = {name: Setting.by_flag(cli[name], flag) for name, flag in _FLAGS.items() if cli.get(name) is not None}
     for name, value in (cli.get("bus_kwargs") or {}).items():
         settings.setdefault(name, Setting.by_flag(value, "--bus-kwargs"))
@@ -160,9 +162,13 @@ def can_line(cli: Mapping[str, Any], rig: Rig | None = None) -> CanLine:
                 settings.setdefault(name, Setting.by_rig(value, rig, f"bus.{name}"))
         for name, value in section.options.items():
             settings.setdefault(name, Setting.by_rig(value, rig, f"bus.options.{name}"))
-    for source in (_from_environment(), _from_files()):
-        for name, setting in source.items():
-            settings.setdefault(name, setting)
+    files: dict[str, Setting] = {}      # of python-can, section [default]; a later file overrides an earlier one
+    environment = _from_environment()
+    for path in CONFIG_FILES:
+        for option, value in _section(Path(os.path.expanduser(path))).items():  # noqa: PTH111 (as python-can does)
+            files[_option(option)] = Setting(_cast(value), path, Origin.BUS_FILE)
+    for name, setting in (*environment.items(), *files.items()):
+        settings.setdefault(name, setting)
     if "interface" in settings and not settings["interface"].value:
         settings.pop("interface", None)
     _check(settings)
@@ -188,17 +194,6 @@ def _from_environment() -> dict[str, Setting]:
         raise UsageError("not a JSON object", where="CAN_CONFIG", next_step=step, entry=MessageCode.BUS_OPTIONS_WRONG)
     for name, value in more.items():
         found.setdefault(_option(name), Setting(_cast(value), "CAN_CONFIG", Origin.BUS_FILE))
-    return found
-
-
-def _from_files() -> dict[str, Setting]:
-    """Return the options of python-can's files, section [default]. A later file overrides an earlier one."""
-    from can.util import CONFIG_FILES
-
-    found: dict[str, Setting] = {}
-    for name in CONFIG_FILES:
-        for option, value in _section(Path(os.path.expanduser(name))).items():  # noqa: PTH111 (as python-can does)
-            found[_option(option)] = Setting(_cast(value), name, Origin.BUS_FILE)
     return found
 
 

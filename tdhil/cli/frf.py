@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Print the responses. Exit 0: every log has one; 3: a log is not complete; 9: a log has no response."""
     from tdhil.api import identify
-    from tdhil.report import PlainConsole, print_responses, stderr_console
+    from tdhil.report import SIMULATED, PlainConsole, print_responses, save_responses, stderr_console
 
     logs: list[Path] = list(namespace.logs)
     while namespace.columns and "=" not in namespace.columns[-1]:
@@ -74,7 +74,14 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.out is not None:
         _write_table(found, namespace.out)
     if namespace.plot is not None:
-        _write_picture(responses, namespace.plot)
+        parts = [(Path(one["log"]).name + (f" · {SIMULATED}" if one["simulated"] else ""), one["frequency_response"])
+                 for one in responses if one["frequency_response"]]
+        try:
+            if parts:
+                save_responses(parts, namespace.plot)
+        except OSError as error:
+            raise UsageError(f"can't be written ({error.strerror or error})", where=f"--plot {namespace.plot}",
+                             entry=MessageCode.FILE_NOT_WRITABLE) from error
     if namespace.json:
         print_json({"kind": "frequency_response", "responses": responses})
     else:
@@ -118,20 +125,6 @@ def _part(result: Result) -> dict[str, Any]:
     else:
         reason = with_code(f"{found.reason}. Advice: {found.advice}", found.entry.code)
     return part | {"reason": reason}
-
-
-def _write_picture(responses: Sequence[dict[str, Any]], path: Path) -> None:
-    from tdhil.report import SIMULATED, save_responses
-
-    parts = [(Path(one["log"]).name + (f" · {SIMULATED}" if one["simulated"] else ""), one["frequency_response"])
-             for one in responses if one["frequency_response"]]
-    if not parts:
-        return
-    try:
-        save_responses(parts, path)
-    except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--plot {path}",
-                         entry=MessageCode.FILE_NOT_WRITABLE) from error
 
 
 def _write_table(found: Sequence[Result], path: Path) -> None:
