@@ -113,7 +113,7 @@ def main() -> int:
     begun = time.process_time()
     missed = [sticking(seed) for seed in range(asked.first, asked.first + asked.strings)]
     bad = sum(bool(one) for one in missed)
-    alarms = smooth(asked.hours, 7) if asked.hours > 0.0 else 0
+    alarms = smooth(asked.hours, 7 + asked.first) if asked.hours > 0.0 else 0
     print(f"{bad} of {asked.strings} strings miss a promise; {alarms} alarms in {asked.hours:g} h of smooth drilling; "
           f"{time.process_time() - begun:.0f} s of CPU")
     return int(bad > 0 or alarms > 0)

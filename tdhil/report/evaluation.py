@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 Part = Mapping[str, Any]
 
 _STYLES = {"as_predicted": "bold green", "differs": "bold yellow"}
+_CRITICAL_ONLY = "critical speed as predicted; the damping is not compared"
 
 
 def evaluation_document(
@@ -61,6 +62,7 @@ def evaluation_document(
             "high": None if found.damping_interval is None else found.damping_interval.high,
         },
         "predicted_least_damping": asdict(prediction.least_damping),
+        "damping_compared": found.damping_compared,
         "ramp_rpm": found.ramp_rpm,
         "trials": [asdict(one) for one in found.trials],
         "torque_rms_nm": {"sticking": found.sticking_rms_nm, "turning": found.turning_rms_nm},
@@ -84,8 +86,14 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
     where = "in the drive's own loop, " if document["controller"]["own_loop"] else ""
     console.print(Words(f"{document['controller']['kind']} controller, {where}on {name}{simulated}", style="bold"))
     verdict = document["verdict"]
-    head = ("verdict", Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
+    head = ("verdict", Words(_CRITICAL_ONLY, style="bold yellow") if _critical_only(document) else
+            Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
     console.print(names_and_texts((head, *_rows(document))))
+
+
+def _critical_only(document: Part) -> bool:
+    """Return whether only the critical speed is as predicted. An old document does not state it."""
+    return document["verdict"] == "as_predicted" and not document.get("damping_compared", True)
 
 
 def _damping(part: Part) -> str:
@@ -187,7 +195,10 @@ def _answer(document: Part) -> AnswerBox:
     gains = law["at_main_shaft"]
     line = (f"{law['kind']} controller, in {'the drive' if law['own_loop'] else 'the host'}: P = "
             f"{gains['gain_nm_s_rad']:.4g} N·m·s/rad, I = {gains['integral_nm_rad']:.4g} N·m/rad at the main shaft")
-    return AnswerBox(_COLOURS.get(verdict, "red"), value, (line,), _VERDICTS[verdict], f"{document['reason']}.", "")
+    colour, words = _COLOURS.get(verdict, "red"), _VERDICTS[verdict]
+    if _critical_only(document):
+        colour, words = "yellow", _CRITICAL_ONLY
+    return AnswerBox(colour, value, (line,), words, f"{document['reason']}.", "")
 
 
 def _beside(document: Part) -> Iterator[tuple[str, str, str]]:

@@ -253,6 +253,12 @@ class Evaluation:
     put_in_j: float
     """Largest energy that the loop's own errors put into the shaft, J."""
 
+    @property
+    def damping_compared(self) -> bool:
+        """Return whether the damping is known well enough to be compared with the prediction."""
+        seen = self.damping_interval
+        return seen is not None and seen.high - seen.low <= OPEN_DAMPING
+
 
 FOREIGN_SHARE = 0.1
 """Largest unknown torque, as a share of the torque that moves the shaft. Above it, the rig is not the identified
@@ -338,7 +344,7 @@ def _verdict(
     if disturbed is not None and disturbed.distance_rpm(critical) > TOLERANCE_RPM:
         return EvaluationOutcome.DIFFERS, words
     if decay is None:
-        return EvaluationOutcome.AS_PREDICTED, words
+        return EvaluationOutcome.AS_PREDICTED, f"{words}; no damping was found in the decay"
     seen = decay[0]
     of_damping = f"damping {seen.value:.3f} ({seen.low:.3f} to {seen.high:.3f})"
     if seen.low > damping.high + TOLERANCE_DAMPING or seen.high < damping.low - TOLERANCE_DAMPING:

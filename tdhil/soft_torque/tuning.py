@@ -61,6 +61,8 @@ CRITICAL_STEPS = 5
 """Number of values of J at which critical speeds of the stated string are simulated."""
 NOT_BETTER_SHARE = 2.0 * NOISY_RESOLUTION
 """Least relative reduction of the critical speed for which new gains are recommended."""
+LEAST_BETTER_SHARE = 0.8
+"""Least share of the draws in which recommended gains are at or below the compared ones."""
 
 
 def tune(
@@ -96,7 +98,7 @@ def tune(
         found = _under_noise(found, samples, held, report)
         stated = replace(search, longest_tick_s=coarse_tick_s(case.string))
         found = list(_without_noise(case, tuple(found), held, stated, report))
-    return Tuning(case, held, tuple(found), search if simulated else None, _advice(case, found), samples.truths)
+    return Tuning(case, held, tuple(found), search if simulated else None, advice_of(found), samples.truths)
 
 
 def best_by_simulation(
@@ -150,7 +152,7 @@ def _under_noise(
     return [done.get(one.kind, one) for one in found]
 
 
-def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
+def advice_of(found: Sequence[Tuned]) -> Advice:
     """Return the advice: the best row that keeps every margin, if it is better than the first row.
 
     Without critical speeds nothing is compared: no row, and no advice to keep the present gains.
@@ -170,21 +172,24 @@ def _advice(case: TuneCase, found: Sequence[Tuned]) -> Advice:
         assert one.cure is not None
         return float(np.mean(np.log(np.minimum(one.cure.values, 1e3))))
 
-    offered.sort(key=mean)
-    best = offered[0]
+    def better_share(one: Tuned) -> float:
+        assert one.cure is not None and base.cure is not None
+        pairs = list(zip(one.cure.values, base.cure.values, strict=True))
+        return sum(new <= old * (1.0 + NOISY_RESOLUTION) for new, old in pairs) / len(pairs)
+
+    def helps(one: Tuned) -> bool:
+        if base.failed:
+            return mean(one) <= mean(base) + NOT_BETTER_SHARE
+        return mean(base) - mean(one) >= log(1.0 + NOT_BETTER_SHARE) and better_share(one) >= LEAST_BETTER_SHARE
+
+    best = min(offered, key=mean)
+    if not helps(best):
+        return Advice(None, base.kind, keep=True, better_share=better_share(best))
     # the soft controller, which every drive can run, is preferred if it is as good
-    soft = next((one for one in offered if one.kind == "soft"), None)
+    soft = next((one for one in offered if one.kind == "soft" and helps(one)), None)
     if soft is not None and mean(soft) < mean(best) + NOT_BETTER_SHARE:
         best = soft
-    assert best.cure is not None
-    pairs = list(zip(best.cure.values, base.cure.values, strict=True))
-    share = sum(new <= old * (1.0 + NOISY_RESOLUTION) for new, old in pairs) / len(pairs)
-    gain = mean(base) - mean(best)
-    if base.failed and mean(best) <= mean(base) + NOT_BETTER_SHARE:
-        return Advice(best.kind, base.kind, keep=False, better_share=share)
-    if gain < log(1.0 + NOT_BETTER_SHARE) or share < 0.8:
-        return Advice(None, base.kind, keep=True, better_share=share)
-    return Advice(best.kind, base.kind, keep=False, better_share=share)
+    return Advice(best.kind, base.kind, keep=False, better_share=better_share(best))
 
 
 def _without_noise(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
+
 import pytest
 
-from tdhil.report import evaluation_document, evaluation_report, write_evaluation_report
+from tdhil.report import PlainConsole, evaluation_document, evaluation_report, print_evaluation, write_evaluation_report
 from tdhil.soft_torque import COLUMNS, Phase, evaluate
 from tests.report.findings import RUN, recording
 from tests.soft_torque.test_evaluation import CASE, PROGRAM, rows
@@ -48,6 +50,20 @@ def test_what_is_no_agreement_is_said_in_the_box(log, colour, words, tmp_path):
     assert page.answer.colour == colour and words in page.answer.reason
     assert bool(page.warnings) is (len(log) <= 100)
     write_evaluation_report(found, log, tmp_path / "x.html")
+
+
+def test_a_damping_that_is_not_compared_is_not_green():
+    log = rows(57.0, (60.0, 56.3, 57.2), damping=0.22)
+    log = log[log[:, COLUMNS.index("phase")] != Phase.RELEASED]            # no decay
+    found = document(log)
+    assert (found["verdict"], found["damping_compared"]) == ("as_predicted", False)
+    answer = evaluation_report(found, log).answer
+    assert answer.colour == "yellow" and "damping is not compared" in answer.verdict
+    assert "no damping was found" in answer.reason
+    printed = io.StringIO()
+    print_evaluation(found, PlainConsole(printed))
+    assert "damping is not compared" in " ".join(printed.getvalue().split())
+    assert document(rows(57.0, (60.0, 56.3, 57.2), damping=0.22))["damping_compared"] is True
 
 
 def test_a_phase_that_never_came_has_no_picture():

@@ -31,6 +31,7 @@ from tdhil.soft_torque import (
     tune,
     tuned_controller,
 )
+from tdhil.soft_torque.tuning import advice_of
 from tests.soft_torque.cases import BIT, DRIVE, SOFT_035, SOFT_1, STIFF, STRING, string_with
 from tests.soft_torque.chain_in_time import ends_turning, reference_case
 
@@ -43,6 +44,44 @@ J = Interval(1500.0, 1440.0, 1560.0)
 def beside_good_gains():
     """Tuning with good present gains: a = 0.35 at 0.84 f₁. They cure at 46 rpm, the best damped ones at 57 or more."""
     return tune(TuneCase(STRING, DRIVE, J, present=SOFT_035, draws=6))
+
+
+def row(kind, cure_rpm, failed=(), spread=0.02):
+    """A row with this critical speed, rpm, over ten draws that share their draw with the other rows."""
+    draws = np.exp(spread * np.linspace(-1.0, 1.0, 10))
+    return Tuned(kind, SOFT_035, failed=failed, cure=DrawnValues(tuple(cure_rpm * draws)))
+
+
+@pytest.mark.parametrize(("rows", "kind"), [
+    ((row("present", 51.3), row("stiff", 150.0), row("soft", 40.0), row("compensated", 39.0)), "soft"),
+    ((row("present", 51.3), row("stiff", 150.0), row("soft", 50.0), row("compensated", 39.0)), "compensated"),
+    # the soft one is within the resolution of the best one, and the best one alone is clearly better than present
+    ((row("present", 51.3), row("stiff", 150.0), row("soft", 49.1), row("compensated", 47.2)), "compensated"),
+    ((row("present", 51.3), row("stiff", 150.0), row("soft", 50.0), row("compensated", 49.0)), None),
+    ((row("present", 51.3), row("stiff", 150.0), row("soft", 60.0), row("compensated", 70.0)), None),
+    ((row("present", 51.3), row("stiff", 150.0), row("soft", 40.0, ("phase",)), row("compensated", 50.9)), None),
+    ((row("present", 51.3, ("phase",)), row("stiff", 150.0), row("soft", 52.0), row("compensated", 70.0)), "soft"),
+    ((row("present", 51.3, ("phase",)), row("stiff", 150.0), row("soft", 60.0), row("compensated", 70.0)), None),
+    ((row("stiff", 150.0), row("soft", 40.0), row("compensated", 45.0)), "soft"),
+    ((row("present", 200.0), row("stiff", 60.0), row("soft", 150.0, ("gain",))), "stiff"),
+])
+def test_the_advice_is_the_best_row_that_is_clearly_better(rows, kind):
+    advice = advice_of(rows)
+    assert advice.kind == kind and advice.keep is (kind is None)
+    assert advice.compared_with == rows[0].kind
+
+
+def test_a_row_that_is_better_in_some_draws_only_is_not_recommended():
+    shared = row("present", 51.3)
+    mixed = np.array(shared.cure.values) * np.where(np.arange(10) < 4, 1.2, 0.6)
+    soft = Tuned("soft", SOFT_035, cure=DrawnValues(tuple(mixed)))
+    advice = advice_of((shared, row("stiff", 150.0), soft))
+    assert advice.keep and advice.better_share == pytest.approx(0.6)
+
+
+def test_without_simulated_critical_speeds_nothing_is_compared():
+    rows = [replace(one, cure=None) for one in (row("present", 1.0), row("stiff", 1.0), row("soft", 1.0))]
+    assert advice_of(rows) == Advice(None, "present", keep=False)
 
 
 @pytest.mark.heavy
