@@ -36,6 +36,10 @@ FASTER_SHARE, FASTER_S, FASTER_BRAKED_S = 0.1, 0.4, 1.0
 s. The last duration applies while the reported torque brakes the shaft. A slipping encoder may report a higher speed
 for a moment."""
 
+REPEATED_S = 0.3
+"""Time, s, for which speed and torque repeat to the last digit before the torque of this time is in doubt. If the
+reports then go on, they were late: this torque did not act after the quick stop, and its impulse does not count."""
+
 INVERTED_S, INVERTED_SHARE = 2.0, 0.3
 """Time, s, and relative tolerance of an inverted sign: the speed rises as a reported torque of the opposite sign
 explains, within this share and the bounds of J."""
@@ -64,6 +68,8 @@ class Runaway:
         self._before: Point | None = None
         self.start_rad_s = 0.0
         self._by_impulse_rad_s: float | None = None
+        self._before_repeats_rad_s: float | None = None
+        self._repeated_s = 0.0
         self._pushing_s = self._pushed_nm = 0.0
         self._apart_nm_s = self._took_s = 0.0
         self._for_s = self._unanswered_s = self._unanswered_rad_s = 0.0
@@ -107,12 +113,19 @@ class Runaway:
         before, self._before = self._before, point
         if before is None or point.time_s <= before.time_s:
             self._by_impulse_rad_s = self.start_rad_s if math.isfinite(known.inertia_high) else None
+            self._before_repeats_rad_s = self._by_impulse_rad_s
             return
         self._for_s += point.time_s - before.time_s
         if self._for_s >= PUSHING_S:
             self._slowest_rad_s = min(self._slowest_rad_s, abs(point.speed))
         self._see_inverted(point, known)
         took_s = point.time_s - before.time_s
+        if point.speed == before.speed and point.torque == before.torque:
+            self._repeated_s += took_s
+        else:
+            if self._repeated_s >= REPEATED_S:
+                self._by_impulse_rad_s = self._before_repeats_rad_s
+            self._repeated_s, self._before_repeats_rad_s = 0.0, self._by_impulse_rad_s
         if self._by_impulse_rad_s is not None:
             # the torque of a string is too uncertain, except for a torque near the limit
             counts = not self._limits.has_drill_string or abs(point.torque) >= DOUBTED_SHARE * self._limits.torque_nm
