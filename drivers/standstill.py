@@ -1,4 +1,4 @@
-"""Standstill by the reported speed, and by the position if a count of the speed is too coarse to show it."""
+"""Standstill by the reported speed, and by the position where the drive has one."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ class PositionSource(NamedTuple):
 class StandstillTest:
     """Test of one reading after the other. ``count_rad_s``: None if the unit of the reported speed is unknown.
 
-    If a count is larger than `STANDSTILL_RAD_S`, or unknown, only zero counts as standstill, and the position must
-    stand too, where the drive has one. ``find_position`` is called once, with the first such zero.
+    A speed signal can be lost and report zero, so the position must stand too, where the drive has one. If a count of
+    the speed is larger than `STANDSTILL_RAD_S`, or unknown, only zero counts as standstill. ``find_position`` is called
+    once, with the first speed that counts.
     """
 
     def __init__(self, count_rad_s: float | None, find_position: Callable[[], PositionSource | None]) -> None:
@@ -48,9 +49,9 @@ class StandstillTest:
 
     def near_zero(self, counts: int) -> bool:
         """Return whether a reported speed, in counts, and the position show standstill. May raise TdhilError."""
-        if not self._coarse and self._count_rad_s is not None:
-            return abs(counts) * self._count_rad_s <= standstill_limit_rad_s(self._count_rad_s)
-        if counts:
+        count_rad_s = self._count_rad_s
+        most_rad_s = 0.0 if self._coarse or count_rad_s is None else standstill_limit_rad_s(count_rad_s)
+        if abs(counts) * (count_rad_s or 1.0) > most_rad_s:
             self._since = None
             return False
         if not self._sought:

@@ -71,10 +71,19 @@ def test_a_coarse_speed_of_zero_needs_a_position_that_stands(rad_s, stands):
     assert turning.sought == 1
 
 
-def test_a_fine_speed_needs_no_position():
-    turning = Turning(1.0)
-    assert StandstillTest(RPM, turning.find).near_zero(0)
-    assert turning.sought == 0
+@pytest.mark.parametrize(("rad_s", "stands"), [(0.0, True), (0.05, True), (0.2, False), (1.0, False)])
+def test_a_fine_speed_of_zero_needs_a_position_that_stands_too(rad_s, stands):
+    """A lost speed signal reports zero, however fine its count is."""
+    turning = Turning(rad_s)
+    test = StandstillTest(RPM, turning.find)
+    within_s = longest_s(turning, test)
+    assert within_s > 9.0 if stands else within_s < 1.0
+    assert turning.sought == 1 and test.remarks() == ()
+
+
+def test_a_fine_speed_without_a_position_is_taken_alone():
+    assert StandstillTest(RPM, lambda: None).near_zero(1)
+    assert not StandstillTest(RPM, lambda: None).near_zero(3)
 
 
 def test_a_position_that_is_not_read_shows_no_standstill():
@@ -119,10 +128,11 @@ def test_canopen(wire, rpm_per_lsb, counts, near):
     assert target.poll().near_zero is near
 
 
+@pytest.mark.parametrize("rpm_per_lsb", [0.1, 10.0])
 @pytest.mark.parametrize("turns", [False, True])
-def test_canopen_with_a_position(wire, turns):
-    """The speed reads zero in counts of 10 rpm, and the shaft turns at 4 rad/s."""
-    peer, target = canopen(wire, 10.0)
+def test_canopen_with_a_position(wire, turns, rpm_per_lsb):
+    """The speed reads zero, in fine counts or in counts of 10 rpm, and the shaft turns at 4 rad/s."""
+    peer, target = canopen(wire, rpm_per_lsb)
     peer.objects |= {(0x608F, 1): u(COUNTS_PER_TURN, 4), (0x608F, 2): u(1, 4), (0x6064, 0): u(0, 4)}
 
     def turn(request):
@@ -132,7 +142,7 @@ def test_canopen_with_a_position(wire, turns):
     peer.before_answer = turn
     report = bare_stop(target, MonotonicClock())
     assert report.ended is (Ended.TURNING if turns else Ended.AT_REST)
-    assert any("The position was compared, too" in remark for remark in report.remarks)
+    assert any("The position was compared, too" in remark for remark in report.remarks) is (rpm_per_lsb == 10.0)
 
 
 def test_canopen_with_another_unit_than_the_profile(wire):
