@@ -42,7 +42,8 @@ EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 12, 130, 143})
 """Exit codes of `tdhil.errors`, except 1 (an internal error) and 2 (an impossible request)."""
 
 _REMOVED = "torque removed"
-_STANDSTILL = "shaft at standstill"
+_STANDSTILL = "shaft at standstill, drive disabled"
+"""End of a live display. A rehearsal names what was required in words of its own."""
 _STANDS = ("valid", "valid_wide")
 
 

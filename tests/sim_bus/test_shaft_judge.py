@@ -107,6 +107,7 @@ def test_a_shaft_is_read_from_a_trace(tmp_path):
      "tdhil: the shaft is at standstill (seen at 13.4 s) and the drive is disabled",
      (True, 13.4, None, -np.inf, False)),
     ({}, "STOP NOT CONFIRMED: torque removed at 12.3 rad/s", (False, None, None, -np.inf, True)),
+    ({}, "required: the shaft at standstill, or the loss of it reported", (False, None, None, -np.inf, False)),
     (None, "", (False, None, None, -np.inf, False)),
 ])
 def test_an_outcome_is_read_from_what_a_process_said(document, said, expected):
