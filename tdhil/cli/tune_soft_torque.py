@@ -26,6 +26,7 @@ from tdhil.cli.tune_inputs import (
     is_number,
     measured_lags,
     positive_number,
+    present_gains,
     profile_for,
     read_bit_noise,
     read_impedance,
@@ -89,7 +90,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
                         help="time constants inside the drive's speed loop (default 0.02 0.01 0.003, assumed)")
     parser.add_argument("--present", type=float, nargs=2, metavar=("P", "I"),
-                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft")
+                        help="gains in the drive now, N·m·s/rad and N·m/rad at the motor shaft, for comparison "
+                             "(default: as measured by --impedance, or as the drive reported them before the run)")
     parser.add_argument("--phase-margin", type=float, default=60.0, metavar="DEG",
                         help="phase margin of the stiff controller (default 60)")
     parser.add_argument("--margins", nargs=3, metavar=("DEG", "DB", "S"),
@@ -138,11 +140,11 @@ def run(namespace: argparse.Namespace) -> int:
     stderr = stderr_console()
     with _progress(stderr, "reading the result"):          # a log is identified again, which takes seconds
         result = read_result(namespace.result)
-    case, lags_from = case_of(result, namespace)
+    case, *sources = case_of(result, namespace)
     profile = profile_for(namespace, result)
     with _progress(stderr, "tuning") as progress:
         tuning = tune(case, None if namespace.no_simulation else Search(), progress)
-        tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
+        tuned_for = _tuned_for(result, namespace, tuning, sources, profile)
         document = tuning_document(tuning, tuned_for)
         if namespace.depths is not None:
             parameters = speed_controller_of(profile, result) if namespace.loop == "drive" else None
@@ -264,8 +266,11 @@ def _schedule(
     return schedule_document(found, ratio, settings)
 
 
-def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str]:
-    """Return the case at the main shaft, and the source of the lags. Raises TuningRefused without J."""
+def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str, str | None]:
+    """Return the case at the main shaft, and the sources of the lags and of the present gains (None: none).
+
+    Raises TuningRefused without J.
+    """
     from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused, with_noise
 
     measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
@@ -286,13 +291,16 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     drive = TopDrive(value, square * estimated(result, "viscous_nm_s_rad"),
                      square**0.5 * estimated(result, "coulomb_nm"), lags)
     present, of_present = (None, ()) if measured is None else _present(measured, square)
-    if namespace.present is not None:
-        present = SpeedController(square * namespace.present[0], square * namespace.present[1])
+    gains, present_from = present_gains(namespace, measured, result)
+    if gains is not None and (measured is None or namespace.present is not None):
+        present = SpeedController(square * gains.gain_nm_s_rad, square * gains.integral_nm_rad)
+    if namespace.loop == "bus" and namespace.present is None and measured is None:
+        present, present_from = None, None         # gains inside the drive do not act on this loop
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
                     namespace.compensate, present, (*found.ends, *of_lags, *of_present), found.inertia_alone_share,
                     required=_required(result, namespace), string_draws=found.draws, inertia_draws=found.inertia_draws,
                     lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
-    return case, lags_from
+    return case, lags_from, present_from
 
 
 def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> RequiredMargins:
@@ -543,7 +551,8 @@ def _moved_lags(
 
 
 def _tuned_for(
-    result: Mapping[str, Any], namespace: argparse.Namespace, tuning: Tuning, lags_from: str, profile: Profile | None
+    result: Mapping[str, Any], namespace: argparse.Namespace, tuning: Tuning, sources: Sequence[str | None],
+    profile: Profile | None,
 ) -> TunedFor:
     from tdhil.report import TunedFor
     from tdhil.soft_torque import drive_settings
@@ -582,5 +591,5 @@ def _tuned_for(
     elif tuning.case.string.bit is None:
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
-                    None if profile is None else profile.name, ratio, namespace.loop, lags_from,
+                    None if profile is None else profile.name, ratio, namespace.loop, sources[0] or "", sources[1],
                     settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED})

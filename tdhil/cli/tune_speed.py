@@ -23,6 +23,7 @@ from tdhil.cli.tune_inputs import (
     inertia_warnings,
     is_number,
     positive_number,
+    present_gains,
     profile_for,
     read_impedance,
     read_result,
@@ -35,7 +36,7 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.report import LoopTunedFor
-    from tdhil.speed_loop import LoopDesign, MeasuredShaft, PiGains, Range, UncertainPlant
+    from tdhil.speed_loop import LoopDesign, MeasuredShaft, Range, UncertainPlant
 
     Lags = tuple[tuple[Range, ...], Range, str]
 
@@ -217,64 +218,6 @@ def _range(ends: tuple[float, float, float]) -> Range:
 
     low, value, high = ends
     return Range(value, low, high)
-
-
-def present_gains(
-    namespace: argparse.Namespace, measured: Mapping[str, Any] | None, result: Mapping[str, Any]
-) -> tuple[PiGains | None, str | None]:
-    """Return the gains in the drive and their source: typed, measured, or as the drive reported them before the run.
-
-    None without gains; the source then states why, or is None if there is none.
-    """
-    from tdhil.speed_loop import PiGains
-
-    if namespace.present is not None:
-        return PiGains(*namespace.present), "as stated (--present)"
-    if measured is not None:
-        gain, integral = (ends_of(measured[key])[1] for key in ("gain_nm_s_rad", "integral_nm_rad"))
-        return _comparable(gain, integral, "as measured (--impedance)")
-    return _reported_gains(result, namespace.rated_torque, namespace.rated_speed)
-
-
-def _reported_gains(
-    result: Mapping[str, Any], rated_torque_nm: float | None, rated_speed_rpm: float | None
-) -> tuple[PiGains | None, str | None]:
-    """Return the gains that the drive reported before the run, and their objects or registers."""
-    from tdhil.soft_torque import one_percent_nm_s_rad
-
-    found = result.get("speed_loop_present")
-    settings = found.get("settings") if isinstance(found, dict) else None
-    if not isinstance(found, dict) or not isinstance(settings, dict):
-        return None, None
-    read = [settings[part] for part in ("gain", "integral") if isinstance(settings.get(part), dict)]
-    source = f"reported by the drive ({', '.join(str(one.get('where')) for one in read)})"
-    unsure = sorted({str(one.get("confidence")) for one in read} - {"verified"}, reverse=True)
-    if unsure:
-        source += f", in units that the profile marks as {unsure[0]}"
-    if len(read) < 2 or not all(is_number(one.get("value")) for one in read):
-        return None, "not known: the drive did not report both gains"
-    gain, integral = (float(found[key]) if is_number(found.get(key)) else None
-                      for key in ("gain_nm_s_rad", "integral_nm_rad"))
-    units = [one.get("unit") for one in read]
-    if gain is None and units[0] == "percent_per_percent":
-        if rated_torque_nm is None or rated_speed_rpm is None:
-            return None, f"{source}; they need --rated-torque and --rated-speed of the motor's name plate"
-        gain = read[0]["value"] * one_percent_nm_s_rad(rated_torque_nm, rated_speed_rpm)
-        time_s = read[1]["value"] * {"s": 1.0, "ms": 1e-3}.get(str(units[1]), 0.0)
-        if integral is None and time_s > 0.0:
-            integral = gain / time_s
-    if "unknown" in units:
-        return None, f"{source}; the profile does not know their units"
-    return _comparable(float(gain or 0.0), float(integral or 0.0), source)
-
-
-def _comparable(gain_nm_s_rad: float, integral_nm_rad: float, source: str) -> tuple[PiGains | None, str]:
-    """Return the gains and their source; None, and why, without a positive P and I."""
-    from tdhil.speed_loop import PiGains
-
-    if gain_nm_s_rad <= 0.0 or integral_nm_rad <= 0.0:
-        return None, f"{source}; P or I is 0, and such a loop is not compared"
-    return PiGains(gain_nm_s_rad, integral_nm_rad), source
 
 
 def shaft_in(result: Mapping[str, Any]) -> MeasuredShaft | None:

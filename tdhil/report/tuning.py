@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 Part = Mapping[str, Any]
 
 _WHAT = {
-    "present": "the gains in the drive now, measured or typed",
+    "present": "the gains in the drive now: reported by it, measured or typed",
     "stiff": "the stiffest PI that keeps its phase margin",
     "soft": "P = ζ/a, I = (φω)² J, with the lowest critical speed that the margins allow",
     "compensated": "the same, with a part of the rotor's inertia compensated",
@@ -96,6 +96,8 @@ class TunedFor:
     loop: str
     lags_from: str
     """Source of the lags in the loop."""
+    present_from: str | None = None
+    """Source of the present gains, or why the reported ones cannot be used. None: none are known."""
     settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
     """Settings in the drive's own parameters, by the controller's kind."""
     warnings: tuple[str, ...] = ()
@@ -126,7 +128,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     return {
         "tuned_for": {
             "source": tuned_for.source, "simulated": tuned_for.simulated, "profile": tuned_for.profile,
-            "loop": tuned_for.loop, "gear_ratio": ratio,
+            "loop": tuned_for.loop, "gear_ratio": ratio, "present_from": tuned_for.present_from,
         },
         "identified": dict(tuned_for.identified),
         "main_shaft": {
@@ -348,6 +350,8 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     yield "string", (f"ζ {string['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after {string['echo_s']:.3f} s, modes at "
                      + ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz")
     yield "bit", string["bit"]["words"] if string["bit"] else "not stated; tdhil reports no critical speeds"
+    if tuned_for.get("present_from"):
+        yield "present gains", tuned_for["present_from"]
     if tuned_for["loop"] == "bus":
         yield "loop", "closed over the bus, in torque mode: the reported speed's lag is in it"
 

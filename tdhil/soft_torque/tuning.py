@@ -175,12 +175,13 @@ def advice_of(found: Sequence[Tuned]) -> Advice:
     def better_share(one: Tuned) -> float:
         assert one.cure is not None and base.cure is not None
         pairs = list(zip(one.cure.values, base.cure.values, strict=True))
-        return sum(new <= old * (1.0 + NOISY_RESOLUTION) for new, old in pairs) / len(pairs)
+        return float(sum(new <= old * (1.0 + NOISY_RESOLUTION) for new, old in pairs) / len(pairs))
 
     def helps(one: Tuned) -> bool:
+        gain = mean(base) - mean(one)
         if base.failed:
-            return mean(one) <= mean(base) + NOT_BETTER_SHARE
-        return mean(base) - mean(one) >= log(1.0 + NOT_BETTER_SHARE) and better_share(one) >= LEAST_BETTER_SHARE
+            return bool(gain >= -NOT_BETTER_SHARE)
+        return bool(gain >= log(1.0 + NOT_BETTER_SHARE)) and better_share(one) >= LEAST_BETTER_SHARE
 
     best = min(offered, key=mean)
     if not helps(best):

@@ -333,7 +333,7 @@ def test_a_measured_lag_of_zero_is_drawn_within_its_interval(tmp_path):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     words = ["result.json", "--string", str(STRING_YAML), "--impedance", str(path)]
-    case, _ = case_of(result(), parser.parse_args(words))
+    case, *_ = case_of(result(), parser.parse_args(words))
     assert case.drive.inner_lags_s == (0.0, 0.03)
     drawn = [truth.drive.inner_lags_s for truth in case.truths()]
     assert max(one[0] for one in drawn) > 0.004
@@ -384,11 +384,33 @@ def test_an_identified_pipe_keeps_its_impedance(tuned):
     assert any("the pipe is the one" in warning for warning in document["warnings"])
 
 
+def present_of(*words, **said):
+    """Return P and I of the present gains at the motor shaft, and their source."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    asked = parser.parse_args(["result.json", "--string", str(STRING_YAML), *words])
+    case, _, source = case_of(result(**said), asked)
+    if case.present is None:
+        return None, source
+    return (case.present.gain_nm_s_rad / 100.0, case.present.integral_nm_rad / 100.0), source     # gear ratio 10
+
+
+def test_the_gains_that_the_drive_reported_are_compared():
+    setting = {"where": "5FFDh:1", "unit": "nm_s_rad", "confidence": "verified", "value": 9.0}
+    reported = {"gain_nm_s_rad": 9.0, "integral_nm_rad": 6.0, "settings": {"gain": setting, "integral": setting}}
+    gains, source = present_of(speed_loop_present=reported)
+    assert gains == pytest.approx((9.0, 6.0)) and source.startswith("reported by the drive (5FFDh:1")
+    typed, source = present_of("--present", "7", "5", speed_loop_present=reported)
+    assert typed == pytest.approx((7.0, 5.0)) and source == "as stated (--present)"
+    assert present_of("--loop", "bus", speed_loop_present=reported) == (None, None)
+    assert present_of() == (None, None)
+
+
 def drawn_of(**said):
     """Return J of each draw, and the (k, J_L) of its string, both at the main shaft."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    case, _ = case_of(result(model="two-mass", **said), parser.parse_args(["result.json"]))
+    case, *_ = case_of(result(model="two-mass", **said), parser.parse_args(["result.json"]))
     truths = case.truths()
     found = [(one.drive.inertia_kg_m2, one.string.stiffness_nm_rad, one.string.bottom_inertia_kg_m2) for one in truths]
     return case, np.log(np.array(found))
