@@ -59,7 +59,10 @@ _WHAT = {
 }
 SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
 """Error of a simulated critical speed, rpm and share: half of the search's step, and the effects of the time step
-and of the simulation's length (stiff loop of the reference case: 182 instead of 183; collars as sections: 1.5 %)."""
+and of the simulation's length (stiff loop of the reference case: 182 instead of 183)."""
+LIGHT_BIT_ERROR_SHARE = 0.04
+"""The share for a bottom end of sections, whose bit has no inertia. The tick of the search gives 75 rpm for 200 m of
+8 inch collars, a chain of masses 78 rpm."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
@@ -115,6 +118,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     taken = [one for one in tuning.tuned if one.controller is not None]
     search = tuning.searched
     lag_s = case.drive.total_lag_s
+    share = SIMULATION_ERROR_SHARE if string.bottom_inertia_kg_m2 > 0.0 else LIGHT_BIT_ERROR_SHARE
     # For |r| > 1 the loop is stable only by the losses of the string, which are not measured.
     warnings, wide_hz = [*tuned_for.warnings], np.geomspace(0.02, 5.0, 300)
     for one in tuning.tuned:
@@ -151,7 +155,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
                 "words": f"{string.bit.describe()}, viscous {string.bottom_viscous_nm_s_rad:g} N·m·s/rad",
             },
         },
-        "controllers": [_controller(one, ratio, tuned_for.settings.get(one.kind, ())) for one in tuning.tuned],
+        "controllers": [_controller(one, ratio, tuned_for.settings.get(one.kind, ()), share) for one in tuning.tuned],
         "reflection": {
             "hertz": hertz.tolist(),
             **{one.kind: reflection_at(case.drive, one.controller, string, hertz).tolist()
@@ -174,7 +178,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     }
 
 
-def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> dict[str, Any]:
+def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting], share: float) -> dict[str, Any]:
     law = one.controller
     head = {"kind": one.kind, "refused": one.refusal or None}
     if law is None:
@@ -204,12 +208,12 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
             "cure": spread_document(one.cure, NOISY_RESOLUTION), "start": spread_document(one.start, NOISY_RESOLUTION),
         },
         "linear_limit_rpm": None if one.linear_limit is None else spread_document(one.linear_limit, 0.0),
-        "critical_rpm": {"cure": _quiet_part(one)} if one.quiet_cures else None,
+        "critical_rpm": {"cure": _quiet_part(one, share)} if one.quiet_cures else None,
         "inertia_wrong_by": [asdict(wrong) for wrong in one.wrong],
     }
 
 
-def _quiet_part(one: Tuned) -> dict[str, float | None]:
+def _quiet_part(one: Tuned, share: float) -> dict[str, float | None]:
     """Return value and ends over all intervals; None: not found below the highest speed tried.
 
     The ends include the search's resolution and the error of the simulation's grid.
@@ -221,7 +225,7 @@ def _quiet_part(one: Tuned) -> dict[str, float | None]:
         known += [end for pair in pairs for end in pair if end is not None]
         return {"value": value, "low": min(known) if known else None, "high": None}
     moved = [[end for end in pair if end is not None] for pair in pairs]
-    error = SIMULATION_ERROR_RPM + SIMULATION_ERROR_SHARE * value
+    error = SIMULATION_ERROR_RPM + share * value
     found = in_squares(Interval(value, min(known), max(known)), [*moved, (value - error, value + error)])
     return {"value": value, "low": found.low, "high": found.high}
 

@@ -19,8 +19,14 @@ linear for a wave that is constant over a tick. Its step is a matrix exponential
 
 **Bit.** J_L dω/dt = a − (ζ + β/2 + B_b) ω − T_f(ω) − n(t). The step is exact for the tangent of the friction curve
 (exponential Rosenbrock–Euler). A tick is divided so that the speed changes little in each part. At zero speed the bit
-sticks while |a − n| ≤ F_s. A bottom without inertia gets the inertia of half a tick of its line, and the line gets
-shorter by half a tick.
+sticks while |a − n| ≤ F_s.
+
+**Light bit.** A bottom with less inertia than half a tick of its line, such as a bit below collars, is a line of the
+same inertia. It ends in a bit without inertia, which is in balance at every moment: a − n = (ζ + β/2 + B_b) ω + T_f(ω).
+Collars on falling friction oscillate at frequencies far above the string's (half a wave in 200 m: 8 Hz). A bit with
+the inertia of a part of its tick would suppress this, and the critical speed would depend on the tick. If the friction
+falls more steeply than the line damps, two speeds are in balance. The bit keeps to the nearest one in its direction of
+acceleration: it jumps at the torques at which its branch ends.
 
 **Bit noise.** n is a first-order Gauss–Markov process. Loops with the same seed have the same noise at every set speed.
 
@@ -54,6 +60,8 @@ LARGEST_GROWTH = 0.05
 """Largest relative growth of the bit's speed in one part of a tick, on a falling branch of its friction."""
 LEAST_GROWTH = 1e-300
 """Value added to an exponent that is used as a divisor, so that it is never exactly zero."""
+BALANCE_STEPS = 4
+"""Number of Newton steps to the speed of a bit without inertia."""
 NOISE_BLOCK = 500
 """Number of ticks of bit noise that are drawn at once."""
 
@@ -79,6 +87,7 @@ class Grid:
     static_nm: tuple[float, ...]
     """Total static dry friction of each segment."""
     bottom_inertia_kg_m2: float
+    """Inertia of the bit. 0: a light bit, whose inertia is part of the last line."""
     line_ticks: tuple[int, ...]
     """Travel time of each line, ticks."""
     line_parts: tuple[int, ...]
@@ -93,15 +102,16 @@ class Grid:
 def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid:
     """Return the grid with the tick for which rounding changes the travel times of all lines least."""
     delays = np.array([line.delay_s for line in string.lines])
-    last = string.lines[-1].impedance_nm_s_rad
+    own_delay_s = string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad
+    light = own_delay_s < 0.5 * longest_tick_s
+    if light:
+        delays[-1] += own_delay_s
 
     def rounded(tick: float) -> tuple[NDArray[np.int64], float]:
-        # A bit with almost no inertia gets the inertia of half a tick of pipe.
-        wanted = delays - np.append(np.zeros(len(delays) - 1), _own_delay_s(string, tick))
-        counts = np.maximum(1, np.rint(wanted / tick)).astype(np.int64)
-        return counts, float(np.abs(counts * tick - wanted).sum())
+        counts = np.maximum(1, np.rint(delays / tick)).astype(np.int64)
+        return counts, float(np.abs(counts * tick - delays).sum())
 
-    if len(delays) == 1 and string.bottom_inertia_kg_m2 >= 0.5 * longest_tick_s * last:
+    if len(delays) == 1:
         exact = float(delays[0]) / ceil(float(delays[0]) / longest_tick_s * (1.0 - 1e-9))
         candidates = np.full(1, exact)
     else:
@@ -113,7 +123,7 @@ def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid
         max(1, min(count, round(line.delay_s / DRAG_EVERY_S))) if line.has_friction else 1
         for line, count in zip(string.lines, counts, strict=True)
     )
-    return _cut(string, tick, counts, parts)
+    return _cut(string, tick, counts, parts, light)
 
 
 def grid_like(string: DrillString, model: DrillString, grid: Grid) -> Grid:
@@ -124,27 +134,26 @@ def grid_like(string: DrillString, model: DrillString, grid: Grid) -> Grid:
     factors = [line.delay_s / other.delay_s for line, other in zip(string.lines, model.lines, strict=True)]
     if max(factors) > 1.001 * min(factors):
         raise ValueError("the travel times of the lines differ by more than one common factor")
-    return _cut(string, grid.tick_s * factors[0], grid.line_ticks, grid.line_parts)
+    return _cut(string, grid.tick_s * factors[0], grid.line_ticks, grid.line_parts, grid.bottom_inertia_kg_m2 == 0.0)
 
 
-def _own_delay_s(string: DrillString, tick_s: float) -> float:
-    """Return the travel time, s, of the pipe that counts as inertia of the bit."""
-    return max(0.0, 0.5 * tick_s - string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad)
-
-
-def _cut(string: DrillString, tick_s: float, counts: tuple[int, ...], parts: tuple[int, ...]) -> Grid:
+def _cut(string: DrillString, tick_s: float, counts: tuple[int, ...], parts: tuple[int, ...], light: bool) -> Grid:
     ticks: list[int] = []
     of_segments: list[tuple[float, float, float, float]] = []
-    for line, count, part in zip(string.lines, counts, parts, strict=True):
+    inertia, last = string.bottom_inertia_kg_m2, string.lines[-1]
+    impedances = [line.impedance_nm_s_rad for line in string.lines]
+    if light:      # the last line has its own inertia and the bit's, even if its travel time is rounded
+        impedances[-1] = (last.length_m * last.inertia_kg_m + inertia) / (counts[-1] * tick_s)
+        inertia = 0.0
+    for line, impedance, count, part in zip(string.lines, impedances, counts, parts, strict=True):
         edges = np.rint(np.linspace(0, count, part + 1)).astype(int)
         for size in np.diff(edges):
             share_m = line.length_m * float(size) / float(count)
             ticks.append(int(size))
-            of_segments.append((line.impedance_nm_s_rad, line.drag_nm_s_rad_m * share_m,
+            of_segments.append((impedance, line.drag_nm_s_rad_m * share_m,
                                 line.coulomb_nm_m * share_m, line.static_nm_m * share_m))
-    impedances, drags, kinetic, static = zip(*of_segments, strict=True)
-    inertia = string.bottom_inertia_kg_m2 + _own_delay_s(string, tick_s) * string.lines[-1].impedance_nm_s_rad
-    return Grid(tick_s, tuple(ticks), impedances, drags, kinetic, static, inertia, counts, parts)
+    along, drags, kinetic, static = zip(*of_segments, strict=True)
+    return Grid(tick_s, tuple(ticks), along, drags, kinetic, static, inertia, counts, parts)
 
 
 @dataclass(frozen=True)
@@ -387,7 +396,8 @@ class PipeSimulation:
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int = 1) -> None:
         self._waves = _Waves(grids, repeats)
-        self._bit = _Bit(strings, grids, repeats)
+        light = grids[0].bottom_inertia_kg_m2 == 0.0
+        self._bit = _LightBit(strings, grids, repeats) if light else _HeavyBit(strings, grids, repeats)
         self._viscous = np.repeat([string.bottom_viscous_nm_s_rad for string in strings], repeats)
         self.bit_rad_s: Array = np.zeros(len(strings) * repeats)
 
@@ -510,7 +520,7 @@ def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lag
 
 
 class _Bit:
-    """Bottom end of the string with its bit. Arrays have one value for each case."""
+    """Friction of the bit and of the lower end of the string. Arrays have one value for each case."""
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
         def each(values: Sequence[float]) -> Array:
@@ -526,24 +536,12 @@ class _Bit:
         self.static_nm = each([bit.static_nm + more for bit, more in zip(bits, along_static, strict=True) if bit])
         self._falls = each([bit.static_nm - bit.coulomb_nm for bit in bits if bit])
         self._width = each([bit.stribeck_speed_rad_s for bit in bits if bit])
-        self._inertia = each([grid.bottom_inertia_kg_m2 for grid in grids])
         self._impedance = each([grid.impedance_nm_s_rad[-1] for grid in grids])
         self._viscous = self._impedance + each([
             string.bottom_viscous_nm_s_rad + 0.5 * grid.drag_nm_s_rad[-1]
             for string, grid in zip(strings, grids, strict=True)])
-        self._tick_s = each([grid.tick_s for grid in grids])
-        # If the friction falls more steeply than the line damps, the speed grows: by at most 5 % in one part of a tick.
-        # If not, the speed tends to an equilibrium, which the exponential of the tangent reaches in one step.
-        steepest = sqrt(2.0 / e) * self._falls / self._width
-        growth = float(np.max(np.maximum(0.0, steepest - self._viscous) / self._inertia * self._tick_s))
-        self._parts = int(np.clip(ceil(growth / LARGEST_GROWTH), 1, 25))
-        self._part_s = self._tick_s / self._parts
-        self._pace = self._part_s / self._inertia
         self._bends = bool(np.any(self._falls > 0.0))
-        self._slower = np.minimum(-self._viscous * self._pace, -1e-9)
-        self._steeper = 2.0 * self._pace / self._width**2
         self._curve = -1.0 / self._width**2
-        self._twice_over_parts = self._impedance / self._parts
         self._rests_harder = any(more > own for more, own in zip(along_static, along, strict=True))
 
     def rubbing(self, speed: Array) -> Array:
@@ -560,6 +558,25 @@ class _Bit:
             return np.zeros_like(speed)
         over: Array = self._falls * np.exp(speed * speed * self._curve)
         return over
+
+
+class _HeavyBit(_Bit):
+    """Bit with inertia."""
+
+    def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
+        super().__init__(strings, grids, repeats)
+        inertia = np.repeat([grid.bottom_inertia_kg_m2 for grid in grids], repeats)
+        tick_s = np.repeat([grid.tick_s for grid in grids], repeats)
+        # If the friction falls more steeply than the line damps, the speed grows: by at most 5 % in one part of a tick.
+        # If not, the speed tends to an equilibrium, which the exponential of the tangent reaches in one step.
+        steepest = sqrt(2.0 / e) * self._falls / self._width
+        growth = float(np.max(np.maximum(0.0, steepest - self._viscous) / inertia * tick_s))
+        self._parts = int(np.clip(ceil(growth / LARGEST_GROWTH), 1, 25))
+        part_s = tick_s / self._parts
+        self._pace = part_s / inertia
+        self._slower = np.minimum(-self._viscous * self._pace, -1e-9)
+        self._steeper = 2.0 * self._pace / self._width**2
+        self._twice_over_parts = self._impedance / self._parts
 
     def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
         """Advance by one tick. Return (wave that goes up, speed after the tick)."""
@@ -582,6 +599,53 @@ class _Bit:
             travel = travel + end if part == self._parts - 1 else travel + 2.0 * end
             speed = end
         return travel * self._twice_over_parts - arriving, speed
+
+
+class _LightBit(_Bit):
+    """Bit without inertia, in balance at every moment.
+
+    The balance torque V ω + F_c + (F_s − F_c) e^−(ω/ω_s)² rises up to a speed ω₁, falls if the friction falls more
+    steeply than V, and rises again from a speed ω₂. It is concave below ω₁ and convex above ω₂. So Newton's method
+    converges from one side: from the tangent at zero speed below, and from the asymptote above.
+    """
+
+    def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
+        from scipy.special import lambertw
+
+        super().__init__(strings, grids, repeats)
+        self._steeper = -2.0 * self._curve
+        # The slope is zero where u e^−u² = V ω_s/2(F_s − F_c), u = ω/ω_s. If it is nowhere zero, both ends of the
+        # branches are at the steepest point, u² = 1/2.
+        falling = np.maximum(self._falls, LEAST_GROWTH)
+        least = np.minimum(0.5 * (self._viscous * self._width / falling) ** 2, (1.0 - 1e-9) / e)
+        ends = []
+        for branch in (0, -1):
+            end = np.sqrt(np.maximum(-0.5 * np.real(lambertw(-least, branch)), 0.0))
+            end = np.where(self._falls > 0.0, end, 0.0) * np.where(self._falls > 0.0, self._width, 1.0)
+            ends.append(self._viscous * end + self._coulomb + self._bent(end))
+        self._slow_below, self._fast_above = ends
+        self._flattest = 1e-3 * self._viscous
+        self._steepest_at = self._width / sqrt(2.0)
+
+    def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
+        """Advance by one tick. Return (wave that goes up, speed in this tick)."""
+        driven = arriving if noise_nm is None else arriving - noise_nm
+        torque = np.abs(driven)
+        rests = torque <= self._coulomb + self._falls
+        found = (torque - self._coulomb) / self._viscous
+        if self._bends:
+            was_fast = speed * np.sign(driven) > self._steepest_at
+            fast = torque > np.where(was_fast, self._fast_above, self._slow_below)
+            rests &= ~fast
+            found -= np.where(fast, 0.0, self._falls / self._viscous)
+            for _ in range(BALANCE_STEPS):
+                bent = self._bent(found)
+                over = self._viscous * found + self._coulomb + bent - torque
+                found = found - over / np.maximum(self._viscous - self._steeper * found * bent, self._flattest)
+        if self._rests_harder:
+            rests |= (speed * driven <= 0.0) & (torque <= self.static_nm)
+        end = np.where(rests, 0.0, np.copysign(found, driven))
+        return 2.0 * self._impedance * end - arriving, end
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -705,8 +769,17 @@ NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPE
 
 
 def coarse_tick_s(string: DrillString) -> float:
-    """Return the longest tick, s, for the search for critical speeds of that string."""
-    return min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
+    """Return the longest tick, s, for the search for critical speeds of that string.
+
+    A light bit whose friction falls more steeply than its line damps jumps from speed to speed. It needs a finer tick.
+    """
+    tick_s = min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
+    last, bit = string.lines[-1].impedance_nm_s_rad, string.bit
+    if bit is not None and string.bottom_inertia_kg_m2 < 0.5 * tick_s * last:
+        steepest = sqrt(2.0 / e) * (bit.static_nm - bit.coulomb_nm) / bit.stribeck_speed_rad_s
+        if steepest > last + string.bottom_viscous_nm_s_rad:
+            return min(tick_s, LONGEST_TICK_S)
+    return tick_s
 
 
 def lowest_turning_with_noise(

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 def lowest_turning_of_chain(
     *, length_m, polar_m4, shear_pa, density, drag, bottom_inertia, bottom_viscous, coulomb_nm, static_nm,
     stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, period_s, lumps=30,
-    wall_nm=0.0, coarse=13, fine=8, lowest=10.0, highest=240.0,
+    wall_nm=0.0, collars=None, coarse=13, fine=8, lowest=10.0, highest=240.0,
 ):
     """Return for each law (P, I, J_c, filter) the lowest set speed, rpm, at and above which a stuck bit comes free.
 
@@ -29,7 +29,7 @@ def lowest_turning_of_chain(
             bottom_inertia=bottom_inertia, bottom_viscous=bottom_viscous, coulomb_nm=coulomb_nm, static_nm=static_nm,
             stribeck_rad_s=stribeck_rad_s, noise_nm=noise_nm, noise_correlation_s=noise_correlation_s,
             inertia=inertia, viscous=viscous, dry_nm=dry_nm, lags_s=lags_s, laws=laws, seed=seed, rpm=rpm,
-            period_s=period_s, lumps=lumps, wall_nm=wall_nm)
+            period_s=period_s, lumps=lumps, wall_nm=wall_nm, collars=collars)
 
     def first(row):
         sticking = np.flatnonzero(~row)
@@ -47,26 +47,32 @@ def lowest_turning_of_chain(
 def ends_turning(
     *, length_m, polar_m4, shear_pa, density, drag, bottom_inertia, bottom_viscous, coulomb_nm, static_nm,
     stribeck_rad_s, noise_nm, noise_correlation_s, inertia, viscous, dry_nm, lags_s, laws, seed, rpm, period_s, lumps,
-    wall_nm=0.0, periods=12.0, calm=3.0, kept=None, keep_every_s=0.02, own_noise=False,
+    wall_nm=0.0, collars=None, periods=12.0, calm=3.0, kept=None, keep_every_s=0.02, own_noise=False,
 ):
     """Return as (laws, speeds) whether the bit turns in the last ``calm`` periods. It is about to break away at first.
 
+    ``collars``: (length in m, polar moment in m⁴, lumps) of a second section below the pipe.
     ``kept``: a list to which (time, torque on the rotor, speed of the top, speed of the bit) are appended; the signals
     have shape (cases,). ``own_noise``: every case has its own bit noise.
     """
-    cell = length_m / lumps
-    spring = shear_pa * polar_m4 / cell
-    mass = np.full(lumps + 1, density * polar_m4 * cell)
-    loss = np.full(lumps + 1, drag * cell)
-    mass[[0, -1]] *= 0.5
-    loss[[0, -1]] *= 0.5
+    sections = [(length_m, polar_m4, lumps)] + ([collars] if collars else [])
+    spring, mass, loss = np.empty((0, 1)), np.zeros(1), np.zeros(1)
+    for length, polar, parts in sections:      # half of a cell's mass and loss is at each of its ends
+        cell = length / parts
+        spring = np.vstack([spring, np.full((parts, 1), shear_pa * polar / cell)])
+        ends = np.full(parts + 1, cell)
+        ends[[0, -1]] *= 0.5
+        mass, loss = (np.append(above, np.zeros(parts)) for above in (mass, loss))
+        mass[-parts - 1 :] += density * polar * ends
+        loss[-parts - 1 :] += drag * ends
+    fastest = max(2.0 / cell for cell in (length / parts for length, _, parts in sections)) * sqrt(shear_pa / density)
+    lumps = len(spring)
     wall = np.full(lumps + 1, wall_nm / lumps)
     wall[[0, -1]] *= 0.5
     mass[0] += inertia
     mass[-1] += bottom_inertia
     loss[0] += viscous
     loss[-1] += bottom_viscous
-    fastest = 2.0 * sqrt(spring / (density * polar_m4 * cell))
     step = min(0.004, 0.25 / fastest)
     target = (np.asarray(rpm) * pi / 30.0)
     cases = target.size
@@ -74,7 +80,7 @@ def ends_turning(
     gain, integral, back, filter_s = laws.T
     target = target.ravel()
     angle = np.zeros((lumps + 1, cases))
-    angle[:] = (static_nm / spring) * np.arange(lumps, -1, -1)[:, None]
+    angle[:-1] = np.cumsum((static_nm / spring)[::-1], axis=0)[::-1]
     speed = np.zeros((lumps + 1, cases))
     speed[0] = target
     summed = np.full(cases, float(static_nm)) + viscous * target + dry_nm

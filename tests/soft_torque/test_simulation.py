@@ -22,7 +22,7 @@ from tdhil.soft_torque import (
     reflection_at,
     simulate,
 )
-from tdhil.soft_torque.simulation import TopDisturbance, _Top
+from tdhil.soft_torque.simulation import TopDisturbance, _LightBit, _Top, coarse_tick_s
 from tests.soft_torque.cases import (
     BIT,
     DRIVE,
@@ -36,7 +36,8 @@ from tests.soft_torque.cases import (
     lumped_chain,
     string_with,
 )
-from tests.soft_torque.chain_in_time import lowest_turning_of_chain
+from tests.soft_torque.chain_in_time import ends_turning as ends_turning_of_chain
+from tests.soft_torque.chain_in_time import lowest_turning_of_chain, reference_case
 
 SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None, "coulomb_nm": 0.0}
 """Bit without dry friction, so that the whole system is linear."""
@@ -173,14 +174,55 @@ def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says
     assert trace.bit_rad_s[trace.time_s < solution.t[swing][-1] + 0.1, 0, 0].max() == pytest.approx(highest, rel=0.03)
 
 
-@pytest.mark.heavy
-def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
-    """With collars as lines, the bit has only the inertia of half a tick. Half of this tick gives the same motion."""
+def above_collars(pipe_m, collars_m, outer_m, **bit):
+    """Return 5 inch pipe above collars that end in a bit without inertia."""
     from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
-    pipe = PipeSection(length_m=1500.0, outer_diameter_m=0.127, inner_diameter_m=0.1086)
-    collars = PipeSection(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
-    string = string_of(StringFile(sections=(pipe,), bottom=BottomEnd(sections=(collars,), **BIT)))
+    pipe = PipeSection(length_m=pipe_m, outer_diameter_m=0.127, inner_diameter_m=0.1086)
+    collars = PipeSection(length_m=collars_m, outer_diameter_m=outer_m, inner_diameter_m=0.0714)
+    return string_of(StringFile(sections=(pipe,), bottom=BottomEnd(sections=(collars,), **{**BIT, **bit})))
+
+
+@pytest.mark.heavy
+def test_the_critical_speed_above_collars_is_that_of_the_chain_with_the_tick_of_tune():
+    """Below 200 m of collars, the lowest speed from which on the bit turns agrees with the chain to 5 %."""
+    string, law = above_collars(2800.0, 200.0, 0.2032), SpeedController(847.1, 1015.4)
+    search = Search(lowest_rpm=64.0, highest_rpm=92.0, coarse_rpm=4.0, longest_tick_s=coarse_tick_s(string))
+    (found,) = lowest_turning(string, [(DRIVE, law)], "stuck", search)
+    chain = reference_case(
+        length_m=2800.0, bottom_inertia=0.0, noise_nm=0.0, laws=[(law.gain_nm_s_rad, law.integral_nm_rad, 0.0, 0.05)],
+        lumps=80, collars=(200.0, np.pi / 32.0 * (0.2032**4 - 0.0714**4), 12), period_s=search.duration_s / 12.0)
+    speeds = np.arange(68.0, 93.0, 1.0)
+    turns = ends_turning_of_chain(**chain, rpm=speeds[None], calm=12.0 * search.calm_s / search.duration_s)[0]
+    assert found == pytest.approx(speeds[~turns].max() + 1.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("outer_m", "jumps"), [(0.2032, False), (0.127, True)])
+def test_a_bit_without_inertia_is_in_balance_and_jumps_only_where_its_branch_ends(outer_m, jumps):
+    """Torque rises and falls slowly: friction and damping balance it. On falling friction, the bit shows hysteresis."""
+    string = above_collars(2000.0, 200.0, outer_m)
+    grid = grid_of(string, 0.03)
+    bit = _LightBit([string], [grid], 1)
+    damping = grid.impedance_nm_s_rad[-1] + 0.5 * grid.drag_nm_s_rad[-1] + 20.0
+    torques = np.linspace(0.0, 8000.0, 1601)
+    speed, seen = np.zeros(1), []
+    for torque in (*torques, *torques[::-1]):
+        _, speed = bit.step(np.array([torque]), speed)
+        seen.append(speed[0])
+    up, down = np.array(seen[:1601]), np.array(seen[1601:])[::-1]
+    for found in (up, down):
+        moves = found > 0.0
+        balance = damping * found + 2500.0 + 2500.0 * np.exp(-((found / 2.5) ** 2))
+        assert balance[moves] == pytest.approx(torques[moves], abs=1.0)
+        assert not moves[torques < 4800.0].any() and moves[torques > 5000.0].all()
+    assert (np.max(np.abs(up - down)) > 2.0) == jumps
+    assert (np.max(np.diff(up)) > 2.0) == jumps
+
+
+@pytest.mark.heavy
+def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
+    """With collars as lines, the bit has no inertia. Half of this tick gives the same motion."""
+    string = above_collars(1500.0, 180.0, 0.203)
     target = np.array([[60.0 * RPM]])
     coarse, fine = (simulate(string, [(DRIVE, STIFF)], Begin("stuck", target), target, 1.0, 12.0, 0.05, tick)
                     for tick in (0.006, 0.003))
