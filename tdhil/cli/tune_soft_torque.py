@@ -140,7 +140,7 @@ def run(namespace: argparse.Namespace) -> int:
     stderr = stderr_console()
     with _progress(stderr, "reading the result"):          # a log is identified again, which takes seconds
         result = read_result(namespace.result)
-    case, *sources = case_of(result, namespace)
+    case, sources = case_of(result, namespace)
     profile = profile_for(namespace, result)
     with _progress(stderr, "tuning") as progress:
         tuning = tune(case, None if namespace.no_simulation else Search(), progress)
@@ -266,11 +266,16 @@ def _schedule(
     return schedule_document(found, ratio, settings)
 
 
-def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str, str | None]:
-    """Return the case at the main shaft, and the sources of the lags and of the present gains (None: none).
+@dataclass(frozen=True)
+class InputSources:
+    """Sources of the lags in the loop and of the present gains. ``present``: None if no gains are known."""
 
-    Raises TuningRefused without J.
-    """
+    lags: str
+    present: str | None
+
+
+def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, InputSources]:
+    """Return the case at the main shaft, and the sources of its inputs. Raises TuningRefused without J."""
     from tdhil.soft_torque import Interval, SpeedController, TopDrive, TuneCase, TuningRefused, with_noise
 
     measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
@@ -292,15 +297,15 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
                      square**0.5 * estimated(result, "coulomb_nm"), lags)
     present, of_present = (None, ()) if measured is None else _present(measured, square)
     gains, present_from = present_gains(namespace, measured, result)
-    if gains is not None and (measured is None or namespace.present is not None):
-        present = SpeedController(square * gains.gain_nm_s_rad, square * gains.integral_nm_rad)
     if namespace.loop == "bus" and namespace.present is None and measured is None:
-        present, present_from = None, None         # gains inside the drive do not act on this loop
+        gains, present_from = None, None         # gains that the drive reports do not act on this loop
+    if gains is not None and measured is None:
+        present = SpeedController(square * gains.gain_nm_s_rad, square * gains.integral_nm_rad)
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
                     namespace.compensate, present, (*found.ends, *of_lags, *of_present), found.inertia_alone_share,
                     required=_required(result, namespace), string_draws=found.draws, inertia_draws=found.inertia_draws,
                     lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
-    return case, lags_from, present_from
+    return case, InputSources(lags_from, present_from)
 
 
 def _required(result: Mapping[str, Any], namespace: argparse.Namespace) -> RequiredMargins:
@@ -551,7 +556,7 @@ def _moved_lags(
 
 
 def _tuned_for(
-    result: Mapping[str, Any], namespace: argparse.Namespace, tuning: Tuning, sources: Sequence[str | None],
+    result: Mapping[str, Any], namespace: argparse.Namespace, tuning: Tuning, sources: InputSources,
     profile: Profile | None,
 ) -> TunedFor:
     from tdhil.report import TunedFor
@@ -591,5 +596,5 @@ def _tuned_for(
     elif tuning.case.string.bit is None:
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
-                    None if profile is None else profile.name, ratio, namespace.loop, sources[0] or "", sources[1],
+                    None if profile is None else profile.name, ratio, namespace.loop, sources.lags, sources.present,
                     settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED})

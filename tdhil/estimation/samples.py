@@ -6,7 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from profiles import CodedText, MessageCode
-from tdhil.recording import BoolArray, FloatArray, Recording, Segment
+from tdhil.recording import BoolArray, FloatArray, Recording, Segment, Stage
+
+LONGEST_LAG_S = 0.5
+"""Longest plausible time constant of a reported speed or torque, s."""
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Feedback that is frozen although it is marked as fresh: the same value repeats while the motion must change it.
@@ -261,6 +264,11 @@ def angle_readings(recording: Recording) -> tuple[FloatArray, FloatArray] | None
     known = np.isfinite(recording.position_rad) & recording.fresh
     return (np.asarray(recording.time_s[known], dtype=np.float64),
             np.asarray(recording.position_rad[known], dtype=np.float64))
+
+
+def acquisitions(recording: Recording) -> tuple[Stage, ...]:
+    """Return stage 5, which gives J; () for a recording without stages."""
+    return tuple(stage for stage in recording.stages if stage.name == "acquire")
 
 
 def excited_window(segment: Segment) -> tuple[float, float]:

@@ -99,13 +99,27 @@ class Grid:
         return self.tick_s * sum(self.ticks)
 
 
+def _own_delay_s(string: DrillString) -> float:
+    """Return the travel time, s, of a line of the last pipe that has the inertia of the bottom."""
+    return string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad
+
+
+def _has_light_bit(string: DrillString, longest_tick_s: float) -> bool:
+    """Return whether the bottom has less inertia than half a tick of its line."""
+    return _own_delay_s(string) < 0.5 * longest_tick_s
+
+
+def _steepest_fall(falls: Array, width: Array) -> Array:
+    """Return the steepest fall of F e^−(ω/ω_s)² over ω, N·m·s/rad: at ω = ω_s/√2."""
+    return sqrt(2.0 / e) * falls / width
+
+
 def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid:
     """Return the grid with the tick for which rounding changes the travel times of all lines least."""
     delays = np.array([line.delay_s for line in string.lines])
-    own_delay_s = string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad
-    light = own_delay_s < 0.5 * longest_tick_s
+    light = _has_light_bit(string, longest_tick_s)
     if light:
-        delays[-1] += own_delay_s
+        delays[-1] += _own_delay_s(string)
 
     def rounded(tick: float) -> tuple[NDArray[np.int64], float]:
         counts = np.maximum(1, np.rint(delays / tick)).astype(np.int64)
@@ -569,7 +583,7 @@ class _HeavyBit(_Bit):
         tick_s = np.repeat([grid.tick_s for grid in grids], repeats)
         # If the friction falls more steeply than the line damps, the speed grows: by at most 5 % in one part of a tick.
         # If not, the speed tends to an equilibrium, which the exponential of the tangent reaches in one step.
-        steepest = sqrt(2.0 / e) * self._falls / self._width
+        steepest = _steepest_fall(self._falls, self._width)
         growth = float(np.max(np.maximum(0.0, steepest - self._viscous) / inertia * tick_s))
         self._parts = int(np.clip(ceil(growth / LARGEST_GROWTH), 1, 25))
         part_s = tick_s / self._parts
@@ -774,10 +788,10 @@ def coarse_tick_s(string: DrillString) -> float:
     A light bit whose friction falls more steeply than its line damps jumps from speed to speed. It needs a finer tick.
     """
     tick_s = min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
-    last, bit = string.lines[-1].impedance_nm_s_rad, string.bit
-    if bit is not None and string.bottom_inertia_kg_m2 < 0.5 * tick_s * last:
-        steepest = sqrt(2.0 / e) * (bit.static_nm - bit.coulomb_nm) / bit.stribeck_speed_rad_s
-        if steepest > last + string.bottom_viscous_nm_s_rad:
+    damps, bit = string.lines[-1].impedance_nm_s_rad + string.bottom_viscous_nm_s_rad, string.bit
+    if bit is not None and _has_light_bit(string, tick_s):
+        falls = np.array(bit.static_nm - bit.coulomb_nm)
+        if _steepest_fall(falls, np.array(bit.stribeck_speed_rad_s)) > damps:
             return min(tick_s, LONGEST_TICK_S)
     return tick_s
 

@@ -333,7 +333,7 @@ def test_a_measured_lag_of_zero_is_drawn_within_its_interval(tmp_path):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     words = ["result.json", "--string", str(STRING_YAML), "--impedance", str(path)]
-    case, *_ = case_of(result(), parser.parse_args(words))
+    case, _ = case_of(result(), parser.parse_args(words))
     assert case.drive.inner_lags_s == (0.0, 0.03)
     drawn = [truth.drive.inner_lags_s for truth in case.truths()]
     assert max(one[0] for one in drawn) > 0.004
@@ -389,10 +389,11 @@ def present_of(*words, **said):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     asked = parser.parse_args(["result.json", "--string", str(STRING_YAML), *words])
-    case, _, source = case_of(result(**said), asked)
+    case, sources = case_of(result(**said), asked)
     if case.present is None:
-        return None, source
-    return (case.present.gain_nm_s_rad / 100.0, case.present.integral_nm_rad / 100.0), source     # gear ratio 10
+        return None, sources.present
+    gear_square = 100.0
+    return (case.present.gain_nm_s_rad / gear_square, case.present.integral_nm_rad / gear_square), sources.present
 
 
 def test_the_gains_that_the_drive_reported_are_compared():
@@ -410,7 +411,7 @@ def drawn_of(**said):
     """Return J of each draw, and the (k, J_L) of its string, both at the main shaft."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    case, *_ = case_of(result(model="two-mass", **said), parser.parse_args(["result.json"]))
+    case, _ = case_of(result(model="two-mass", **said), parser.parse_args(["result.json"]))
     truths = case.truths()
     found = [(one.drive.inertia_kg_m2, one.string.stiffness_nm_rad, one.string.bottom_inertia_kg_m2) for one in truths]
     return case, np.log(np.array(found))

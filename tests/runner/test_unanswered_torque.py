@@ -113,10 +113,14 @@ def test_in_speed_mode_a_speed_that_is_constant_with_the_torque_at_its_limit_is_
     assert found(lambda _: LIMIT_NM, lambda _: STILL_RAD_S, mode=Mode.SPEED) is None
 
 
-def held(until_s=6.0, speed_rad_s=0.0, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, moved=True):
-    """Return the time at which a held shaft is found, s; the speed is reported from the first point on."""
-    return first(HeldShaft(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
-                 lambda _: Command(mode, setpoint_rad_s, torque_nm), moved=moved)
+def constant(kind, until_s, *, speed_rad_s, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, **said):
+    """Return the time at which a rule of this kind finds reports that stay the same from the first point on, s."""
+    return first(kind(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
+                 lambda _: Command(mode, setpoint_rad_s, torque_nm), **said)
+
+
+def held(until_s=6.0, **other):
+    return constant(HeldShaft, until_s, **{"speed_rad_s": 0.0} | other)
 
 
 def test_a_shaft_that_moved_and_stands_with_the_torque_at_its_limit_is_held_or_not_measured():
@@ -138,10 +142,8 @@ def test_the_time_of_a_held_shaft_begins_anew():
                  lambda _: Command(Mode.SPEED, 4.0, 0.0)) is None
 
 
-def strained(until_s=8.0, speed_rad_s=4.0, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, known=False):
-    """Return the time at which a torque at its limit is found, s."""
-    return first(TorqueAtLimit(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
-                 lambda _: Command(mode, setpoint_rad_s, torque_nm), known=known)
+def strained(until_s=8.0, **other):
+    return constant(TorqueAtLimit, until_s, **{"speed_rad_s": 4.0, "known": False} | other)
 
 
 def test_a_speed_at_its_setpoint_needs_no_torque_at_its_limit():

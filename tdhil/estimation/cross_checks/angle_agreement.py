@@ -18,10 +18,9 @@ from profiles import MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.result import Refusal
-from tdhil.estimation.samples import Samples, excited_window, usable_samples
+from tdhil.estimation.samples import LONGEST_LAG_S, Samples, acquisitions, excited_window, usable_samples
 from tdhil.recording import Recording
 
-_LAG_S = 0.5              # s; longest plausible lag of a reported speed
 _END_S = 0.5              # s; time at either end of a stretch over which its speed is averaged
 _LEAST_S = 2.0            # s; least duration of a stretch
 _LEAST_READINGS = 8       # fewest readings of the angle in a stretch
@@ -67,7 +66,7 @@ def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: flo
     change = abs(float(np.mean(ends[1])) - float(np.mean(ends[0])))
     ratio = float(turned[-1] - turned[0]) / way
     # for an angle without steps the smallest change is not its resolution; the median change bounds both
-    open_rad = 2.0 * min(count, float(np.median(steps))) + _LAG_S * change * abs(ratio)
+    open_rad = 2.0 * min(count, float(np.median(steps))) + LONGEST_LAG_S * change * abs(ratio)
     open_rad += 0.5 * recording.speed_resolution_rad_s * (end - begin)
     return AngleRatio(where, ratio, open_rad / abs(way))
 
@@ -87,7 +86,7 @@ def mean_speed(recording: Recording, start_s: float, end_s: float) -> tuple[floa
     way = float(np.trapezoid(speed, time)) + float(speed[0]) * float(gaps[0]) + float(speed[-1]) * float(gaps[-1])
     ends = [inside.between(at, at + _END_S).speed_rad_s for at in (float(time[0]), float(time[-1]) - _END_S)]
     change = abs(float(np.mean(ends[1])) - float(np.mean(ends[0])))
-    return way / (end_s - start_s), _LAG_S * change / (end_s - start_s) + 0.5 * recording.speed_resolution_rad_s
+    return way / (end_s - start_s), LONGEST_LAG_S * change / (end_s - start_s) + 0.5 * recording.speed_resolution_rad_s
 
 
 def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) -> list[tuple[str, float, float]]:
@@ -111,7 +110,7 @@ def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[An
     steady = [("stage 2", level.start_s, level.end_s) for level in recording.levels]
     segments = () if recording.excitation is None else recording.excitation.segments
     excited = [("stage 5", *excited_window(segment)) for segment in segments] or [
-        ("stage 5", stage.start_s, stage.end_s) for stage in recording.stages if stage.name == "acquire"
+        ("stage 5", stage.start_s, stage.end_s) for stage in acquisitions(recording)
     ]
     found = tuple(
         tuple(one for row in rows for part in _unbroken(recording, *row)

@@ -77,6 +77,12 @@ def level_torques(recording: Recording, samples: Samples) -> tuple[LevelTorque, 
     return tuple(found)
 
 
+def least_torque_scale_change(recording: Recording, samples: Samples) -> float | None:
+    """Return the least relative change of the torque scale that the mean torques show; None without a comparison."""
+    ratios = [one.ratio for one in level_torques(recording, samples) if one.ratio > 0.0]
+    return min((max(ratio / LEAST, MOST / ratio) - 1.0 for ratio in ratios), default=None)
+
+
 def level_contradiction(recording: Recording, samples: Samples) -> Refusal | None:
     """Return the contradiction if the mean torque is far from the torque by the levels; else None."""
     for one in level_torques(recording, samples):

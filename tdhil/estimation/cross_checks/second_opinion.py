@@ -20,7 +20,7 @@ from profiles.quantities import printed_interval
 from tdhil.config import has_plateaus
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_curve
-from tdhil.estimation.cross_checks.level_torque import LEAST, MOST, level_torques
+from tdhil.estimation.cross_checks.level_torque import least_torque_scale_change
 from tdhil.estimation.cross_checks.momentum import BalanceKind, Balances, balances
 from tdhil.estimation.cross_checks.momentum_fit import (
     UNKNOWN_DELAY,
@@ -33,7 +33,7 @@ from tdhil.estimation.cross_checks.momentum_fit import (
 from tdhil.estimation.cross_checks.speed_loop import speed_loop
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
-from tdhil.estimation.samples import usual_interval
+from tdhil.estimation.samples import acquisitions, usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
@@ -44,7 +44,6 @@ _WORTH_A_FIT = 0.005
 """Least share of J that reading in step may add with a usual speed loop, for a fit of the drive's own loop."""
 
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
-_ACQUISITION = "acquire"  # the stage that gives J
 _CONTRADICTION = 1e-3
 """Probability of withdrawing a sound result, given noise and undetected nonlinear friction."""
 
@@ -62,7 +61,7 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     warnings = (*finding.warnings, *disagreements(opinions, finding))
     # If a signal changes its scale during the run, the balances of the whole run contradict one another, and their
     # interval becomes so wide that J agrees with it. The balances before stage 5 do not have this problem.
-    begun = next((stage.start_s for stage in case.recording.stages if stage.name == _ACQUISITION), None)
+    begun = next((stage.start_s for stage in acquisitions(case.recording)), None)
     before: Fitted = ()
     if begun is not None:
         earlier = replace(
@@ -78,10 +77,10 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
         least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / len(against)) * half / reference.value)
         note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
         opinions = (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
-    elif case.recording.has_drill_string and finding.inertia and all(one.agrees is None for one in opinions):
-        # the least change of the torque scale that the mean torques show, as no momentum balance can be compared with J
-        ratios = [one.ratio for one in level_torques(case.recording, case.samples) if one.ratio > 0.0]
-        hidden = min((max(ratio / LEAST, MOST / ratio) - 1.0 for ratio in ratios), default=None)
+    elif (case.recording.has_drill_string and finding.inertia is not None
+            and all(one.agrees is None for one in opinions)):
+        # no momentum balance can be compared with J
+        hidden = least_torque_scale_change(case.recording, case.samples)
         amount = "" if hidden is None else f" of less than {hidden:.0%}"
         warnings = (*warnings, CodedText(
             f"this run does not show a change{amount} in the scale of torque or speed. If a scale changed, J has an "

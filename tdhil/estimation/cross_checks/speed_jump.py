@@ -27,6 +27,7 @@ import numpy as np
 from profiles import MessageCode
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.result import Refusal
+from tdhil.estimation.samples import LONGEST_LAG_S, acquisitions
 from tdhil.recording import FloatArray, Recording
 
 POINT_S = 0.04
@@ -34,9 +35,6 @@ POINT_S = 0.04
 
 SLOPE_S = 0.12
 """Time over which a slope of the reported speed is taken, s."""
-
-LONGEST_LAG_S = 0.5
-"""Longest plausible time constant of a report, s."""
 
 MEMORY_S = 6.0 * LONGEST_LAG_S
 """Time during which an earlier torque affects the reported slope, s."""
@@ -58,8 +56,6 @@ NORMAL_MEDIAN = 1.4826
 MOST = 0.9
 """Slope as a share of the bound: 0.76 at most in healthy runs above a string (`benchmarks/healthy_runs.py`); 1.01 if
 the scale of a sensor doubled in stage 5, 1.4 if it lost a tenth in stage 4 (`benchmarks/lying_reports.py`)."""
-
-_LAST_STAGE = "acquire"   # the stage that gives J
 
 _IN_A_ROW = 2             # points in a row beyond the bound: a single false report is not a change of scale
 
@@ -119,7 +115,7 @@ def jump_contradiction(recording: Recording, inertia_low_kg_m2: float, inertia_k
     slower = np.maximum(0.0, (middle + half) - lowest) / inertia_low_kg_m2 + blur
     bound = np.where(slope > 0.0, faster, slower)
     beyond = np.abs(slope) > MOST * bound                    # False if one of them is unknown
-    beyond &= time_s[:, 0] < max((one.end_s for one in recording.stages if one.name == _LAST_STAGE), default=math.inf)
+    beyond &= time_s[:, 0] < max((stage.end_s for stage in acquisitions(recording)), default=math.inf)
     for shift in range(1, _IN_A_ROW):
         beyond[shift:] &= beyond[:-shift]
     if not np.any(beyond):
