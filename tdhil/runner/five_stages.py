@@ -36,7 +36,8 @@ from tdhil.runner.preconditions import (
 from tdhil.runner.programs import Run, identify, offset_impedance
 from tdhil.runner.settings import ExcitationRequest, StopRequest
 from tdhil.runner.stage_log import StageBook
-from tdhil.runner.stages import NOT_YET, measure_offsets
+from tdhil.runner.stages import NOT_YET, measure_torque_offset
+from tdhil.runner.standstill import standstill_speed
 from tdhil.runner.stop import StopReport, StopSequence, mode_not_left
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, refuse_unconfirmed_speed
 
@@ -178,7 +179,8 @@ class Runner:
         loop = self._make_loop(task, preflight, no_worker_process)
         mode = choose_mode(task.request, task.limits, preflight)
         self._before_echo = identified_before_echo(task.request.kind)
-        _, torque_offset_nm = measure_offsets(loop, task.limits)
+        at_rest_rad_s = standstill_speed(task.limits, preflight.speed_resolution_rad_s)
+        torque_offset_nm = measure_torque_offset(loop, at_rest_rad_s)
         loop.guard.observer.torque_offset_nm = torque_offset_nm
         run = Run(
             task, mode, loop, preflight, torque_offset_nm, prior, self._book, self._log, self._display, self._say,

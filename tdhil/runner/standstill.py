@@ -15,8 +15,13 @@ After the drive has removed its torque in motion, it is at least the longest tim
 
 from __future__ import annotations
 
-from drivers import PowerState, Sample
+from drivers import STANDSTILL_RAD_S, PowerState, Sample
 from tdhil.runner.observer import Observer
+from tdhil.runner.settings import MachineLimits
+
+AT_REST_SHARE = 0.005
+"""Share of the speed limit below which a speed counts as standstill, at most `STANDSTILL_RAD_S`. Three counts of the
+reported speed if that is more."""
 
 NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT)
 """States without torque on the shaft (CiA 402-2, state machine). "Not ready to switch on" is not among them, because
@@ -27,6 +32,11 @@ COUNT_SHARE, COUNT_FACTOR = 0.1, 2.0
 it. A drive may report coarser than its profile states, and noise then shows a count now and then. Seed 239 of
 `benchmarks/healthy_runs.py` has a count of 1.05 times the standstill speed in 3 % of its samples at rest. Seed 1215 has
 one of 3 times in 1 %: a count of any size is noise if the position shows standstill."""
+
+
+def standstill_speed(limits: MachineLimits, speed_resolution_rad_s: float) -> float:
+    """Return the highest reported speed that counts as standstill, rad/s."""
+    return max(3.0 * speed_resolution_rad_s, min(AT_REST_SHARE * limits.speed_max_rad_s, STANDSTILL_RAD_S))
 
 
 class CountsOfNoise:

@@ -36,7 +36,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers import (
-    STANDSTILL_RAD_S,
     Command,
     CommandRejected,
     Drive,
@@ -55,7 +54,7 @@ from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.guard import kept_within
 from tdhil.runner.observer import FASTER_SHARE, RUN_OUT_S, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
-from tdhil.runner.standstill import NO_TORQUE, CountsOfNoise, Standstill
+from tdhil.runner.standstill import NO_TORQUE, CountsOfNoise, Standstill, standstill_speed
 from tdhil.runner.string_release import MEAN_S, StringRelease, StringReleaseLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -190,10 +189,6 @@ class StopTimeout:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-AT_REST_SHARE = 0.005
-"""Share of the speed limit below which a speed counts as standstill, at most `STANDSTILL_RAD_S`. Three counts of the
-reported speed if that is more."""
-
 LONGEST_GAP_S, LONGEST_GAP_CYCLES = 0.2, 3
 """Longest gap in the feedback at standstill, s and cycles (the longer one counts); a slow line may lose a frame."""
 
@@ -268,8 +263,7 @@ class StopSequence:
         assumptions = assumptions or ControlAssumptions()
         self._loop = loop
         self._limits = limits
-        self._at_rest_rad_s = max(
-            3.0 * speed_resolution_rad_s, min(AT_REST_SHARE * limits.speed_max_rad_s, STANDSTILL_RAD_S))
+        self._at_rest_rad_s = standstill_speed(limits, speed_resolution_rad_s)
         self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * loop.period_s)
         self._settle_s = 3.0 * assumptions.largest_speed_lag_s
         # Three times the ramp from the highest speed, for a drive at its torque limit, and the settling.
@@ -741,18 +735,21 @@ class StopSequence:
                     self._trouble.append("the drive sent no feedback after it was disabled")
                     return True
                 continue
+            self._ask_position(sample.time_s)
             # Polls are further apart than cycles. Of a longer gap only the longest permitted one counts.
             apart_s = sample.time_s - heard_s if self._polls.standing else 0.0
             quiet_s += max(self._loop.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
             speed_rad_s = observer.speed_rad_s(sample)
-            if not noise.explains(speed_rad_s, quiet=abs(speed_rad_s) <= self._at_rest_rad_s):
+            stands, by_position_rad_s = observer.angle_quiet(self._at_rest_rad_s), observer.rate_rad_s or 0.0
+            if not (noise.explains(speed_rad_s, quiet=abs(speed_rad_s) <= self._at_rest_rad_s) and stands):
                 quiet_s = 0.0
                 noise.restart()
                 if not turned:
                     turned = True
+                    seen_rad_s, by = (sample.speed_rad_s, "") if stands else (by_position_rad_s, " by its position")
                     self._trouble.append(
-                        f"the shaft began to turn ({sample.speed_rad_s:.3f} rad/s) once its torque was off:"
+                        f"the shaft began to turn ({seen_rad_s:.3f} rad/s{by}) once its torque was off:"
                         " is torque trapped in the load, or does a weight hang on it?"
                     )
             elif quiet_s >= enough_s:

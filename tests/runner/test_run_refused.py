@@ -11,6 +11,7 @@ from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.stages.setup import TORQUE_SEEN_S
 from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive, refused_check
+from tests.runner.reporting_drive import Reporting
 from tests.runner.run_outcomes import assert_at_rest, outcomes
 
 
@@ -66,11 +67,17 @@ def test_a_refused_preflight_moves_nothing_and_says_how_to_mend_it(world):
     assert_nothing_moved(here, result)
 
 
-def test_a_shaft_that_already_turns_is_left_alone(world):
-    here = world(FakeDrive(speed=1.0, coulomb=0.0, viscous=0.0))
+@pytest.mark.parametrize(
+    ("speed_rad_s", "reported_rad_s", "shown"),
+    [(1.0, None, "speed 1.000 rad/s"), (0.08, None, "speed 0.080 rad/s"), (0.3, 0.0, "0.300 rad/s by its position")],
+)
+def test_a_shaft_that_already_turns_is_left_alone(world, speed_rad_s, reported_rad_s, shown):
+    """Standstill is that of the stop: 0.5 % of the limit of 10 rad/s, by speed and by position."""
+    here = world(Reporting(speed=speed_rad_s, coulomb=0.0, viscous=0.0, sees=reported_rad_s, with_position=True))
     result = here.runner().run()
     assert isinstance(result.cause, PreflightRefused)
     assert "already turns" in str(result.cause)
+    assert shown in str(result.cause)
     assert result.stop is None
     assert not [call for call in here.drive.calls if call.startswith("enable")]
 

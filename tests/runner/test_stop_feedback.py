@@ -4,7 +4,8 @@ import pytest
 
 from drivers.drive import PositionReading, PowerState
 from drivers.errors import CommunicationLost
-from tdhil.runner.stop import AT_REST_SHARE, LONGEST_GAP_CYCLES, LONGEST_GAP_S, POSITION_EVERY_S
+from tdhil.runner.standstill import AT_REST_SHARE
+from tdhil.runner.stop import LONGEST_GAP_CYCLES, LONGEST_GAP_S, POSITION_EVERY_S
 from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive, lost
 from tests.runner.stop_calls import LAG_S, SILENT, asked
 

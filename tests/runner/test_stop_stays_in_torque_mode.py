@@ -6,7 +6,8 @@ import pytest
 
 from drivers.drive import Mode, PowerState
 from drivers.errors import ModeNotConfirmed
-from tdhil.runner.stop import AT_REST_SHARE, MODE_S, TORQUE_FALLS_S, mode_not_left
+from tdhil.runner.standstill import AT_REST_SHARE
+from tdhil.runner.stop import MODE_S, TORQUE_FALLS_S, mode_not_left
 from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive
 from tests.runner.string_drive import RESIDUAL_NM, STRING, StringWorld
 

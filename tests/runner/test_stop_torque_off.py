@@ -1,10 +1,13 @@
 """What the stop sequence sees of a shaft once its torque is off."""
 
+import math
+
 import pytest
 
 from drivers.drive import PowerState
 from tdhil.runner.stop import REST_AFTER_S
 from tests.runner.fake_drive import PERIOD_S
+from tests.runner.reporting_drive import Reporting
 from tests.runner.stop_calls import LAG_S, SILENT
 
 
@@ -45,6 +48,21 @@ def test_a_shaft_that_goes_on_turning_once_it_is_disabled_is_not_confirmed(world
     assert report.confirmed is False
     assert "began to turn" in report.trouble[-1]
     assert since[-1] - since[0] == pytest.approx(REST_AFTER_S, abs=0.1)
+
+
+def test_a_shaft_that_turns_by_its_position_once_it_is_disabled_is_not_confirmed(world):
+    """Its speed signal was lost in the same moment."""
+    here = world(Reporting(with_position=True))
+    here.turn(5.0)
+    here.guard.observer.position(1e-3, math.inf)
+    since = when_off(here.drive, [0.0])
+    plain = here.drive.misbehave
+    here.drive.misbehave = lambda drive, sample: (
+        plain(drive, sample)._replace(position_rad=drive.angle + 0.15 * PERIOD_S * len(since)))
+    report = here.stop_sequence().run()
+    assert report.disabled
+    assert report.confirmed is False
+    assert "rad/s by its position) once its torque was off" in report.trouble[-1]
 
 
 def test_a_shaft_at_rest_is_watched_for_as_long_as_reports_may_lag(world):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
         OffsetPlan as OffsetPlan, reference_plan as reference_plan, run_offset as run_offset, run_pilot as run_pilot,
     )
     from tdhil.runner.stages.set_speed import go_to as go_to
-    from tdhil.runner.stages.setup import measure_offsets as measure_offsets, probe_sign as probe_sign
+    from tdhil.runner.stages.setup import measure_torque_offset as measure_torque_offset, probe_sign as probe_sign
     from tdhil.runner.stages.speed import RampCourse as RampCourse, SpeedResult as SpeedResult, run_speed as run_speed
     from tdhil.runner.stages.speed_steps import (
         STEPS_RESERVE_S as STEPS_RESERVE_S, plan_steps as plan_steps, plan_steps_before as plan_steps_before,
@@ -29,7 +29,7 @@ else:
         "hold": "MeanSpeedControl run_hold",
         "impedance": "OffsetPlan reference_plan run_offset run_pilot",
         "set_speed": "go_to",
-        "setup": "measure_offsets probe_sign",
+        "setup": "measure_torque_offset probe_sign",
         "speed": "RampCourse SpeedResult run_speed",
         "speed_steps": "STEPS_RESERVE_S plan_steps plan_steps_before refuse_other_shaft run_steps",
         "torque": "TorqueResult run_torque",

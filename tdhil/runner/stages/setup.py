@@ -22,19 +22,26 @@ TORQUE_SEEN_S = 0.5
 """Time, s, after which a torque above the probe's ends the probe in speed mode; time of zero torque at its end."""
 
 
-def measure_offsets(loop: ControlLoop, limits: MachineLimits) -> tuple[float, float]:
-    """Return the mean reported speed and torque at standstill. Raises PreflightRefused if the shaft turns."""
+def measure_torque_offset(loop: ControlLoop, at_rest_rad_s: float) -> float:
+    """Return the mean reported torque at standstill, N·m. Raises PreflightRefused if the shaft turns.
+
+    ``at_rest_rad_s``: highest speed that counts as standstill (`tdhil.runner.standstill`), rad/s.
+    """
     held = trace(loop.hold(Command(Mode.SPEED, 0.0, 0.0), STANDSTILL_S))
     if len(held.time_s) == 0:
         raise PreflightRefused("no feedback from the drive", where="TPDO1",
                                next_step="Check that the node is operational", entry=MessageCode.NO_FEEDBACK)
     speed = float(held.speed_rad_s.mean())
-    if abs(speed) > 0.01 * limits.speed_max_rad_s:
+    rate_rad_s = loop.guard.observer.rate_rad_s
+    by_position = "" if rate_rad_s is None else f" ({rate_rad_s:.3f} rad/s by its position)"
+    if abs(speed) > at_rest_rad_s or not loop.guard.observer.angle_quiet(at_rest_rad_s):
         raise PreflightRefused(
-            f"the shaft already turns at {speed:.3f} rad/s", where="setup", next_step="Bring it to standstill first",
+            f"the shaft already turns: speed {speed:.3f} rad/s{by_position}, and at most {at_rest_rad_s:.3g} rad/s is"
+            " standstill", where="setup",
+            next_step="Bring it to standstill first, or correct the offset of the reported speed",
             entry=MessageCode.SHAFT_TURNS,
         )
-    return speed, float(held.torque_nm.mean())
+    return float(held.torque_nm.mean())
 
 
 def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resolution_rad_s: float) -> float | None:
