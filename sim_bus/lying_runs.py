@@ -224,6 +224,8 @@ TOLD: tuple[LieWithValue, ...] = (
         "speed-swapped", "torque-swapped", "speed-torque-swapped", "status-zero", "status-ones", "status-frozen",
         "feedback-zero", "feedback-ones", "frozen-feedback", "motor-polarity", "quick-stop-inverted")),
     *_each("torque-constant", "0.5", "0.9", "1.1", "2"), *_each("torque-stuck", "-0.3", "0.3", of="torque"),
+    # new ones go to the end: the number of a combination is its seed
+    *_each("demand-scale", "0.1", "10"), *_each("position-scale", "0.1", "10"), *_each("sensor-slips", "10%"),
 )
 
 MOMENTS = ("", "setup+2s", "speed+12s", "torque+3s", "hold+3s", "acquire+20s", "stop", "stop+500ms")

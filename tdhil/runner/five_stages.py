@@ -191,7 +191,7 @@ class Runner:
     def _check_drive(self, task: Task) -> Preflight:
         """Run the drive's preflight with the limits of the task. Raises PreflightRefused with its first refusal."""
         limits = task.limits
-        preflight = self._book.preflight = self._drive.preflight(
+        found = self._drive.preflight(
             DriveLimits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
@@ -201,6 +201,8 @@ class Runner:
                 or (task.case is not None and task.case.torque_offset),
             )
         )
+        taken = preconditions.scales_taken_as_true(found, calibrated=task.calibrated)
+        preflight = self._book.preflight = replace(found, checks=(*found.checks, *taken))
         self._display.preflight(preflight)
         for check in preflight.checks:
             wanted = f"required {check.wanted}, " if check.wanted else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -15,8 +15,10 @@ from drivers import (
     NO_WATCHDOG_FLAG,
     NOTHING_STOPS_IT,
     SHARED_FLAG,
+    Check,
     CommunicationLost,
     Mode,
+    Outcome,
     Paced,
     Preflight,
     PreflightRefused,
@@ -212,6 +214,22 @@ def precondition_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
     if found.get("fed_by_any_client") is True:
         return (_WARNING_SHARED,)
     return (_WARNING,) if found.get("armed") is False else ()
+
+
+def scales_taken_as_true(preflight: Preflight, *, calibrated: bool) -> Iterator[Check]:
+    """Yield a row for each scale that no report of this drive can show to be wrong (`docs/explanation/stop.md`).
+
+    ``calibrated``: a torque calibration is applied to the result.
+    """
+    if not calibrated:
+        yield Check(
+            "torque scale", "", "not checked: if all reports of torque have the same wrong scale, none contradicts"
+            " another", Outcome.NOTE, "rated torque",
+            "Calibrate the torque (tdhil calibrate torque): J is wrong by the same factor")
+    if preflight.position_period_s is None:
+        yield Check(
+            "speed scale", "", "not checked: no position comes with the cycle", Outcome.NOTE, "speed report",
+            "Compare the reported speed with the shaft's before you confirm it")
 
 
 def correct(error: BaseException, preflight: Preflight | None) -> None:

@@ -62,6 +62,8 @@ class Task:
     assumptions: ControlAssumptions = field(default_factory=ControlAssumptions)
     case: EvaluationCase | StepCase | None = None
     """Virtual string or small steps of the set speed in stage 5, in place of an excitation."""
+    calibrated: bool = False
+    """A torque calibration is applied to the result."""
 
     @property
     def string_at_motor_nm_s_rad(self) -> float:

@@ -279,7 +279,7 @@ class RunSession:
         asked = excitation_request(request.options, bench)
         if request.case is not None:
             asked = ExcitationRequest(mode=request.case.mode, reference_filter_s=asked.reference_filter_s)
-        return Task(limits, asked, facts(bench), case=request.case)
+        return Task(limits, asked, facts(bench), case=request.case, calibrated=KEPT in log.run)
 
 
 def configuration(request: RunRequest) -> dict[str, Any]:

@@ -258,8 +258,9 @@ class World:
         self.drive.speed = speed
         self.bench.hold(Command(mode, speed, torque), 0.2)
 
-    def runner(self, request: ExcitationRequest | None = None, confirm=lambda *_: None, **options) -> Runner:
-        task = Task(self.limits, request or ExcitationRequest(periods=2), {})
+    def runner(self, request: ExcitationRequest | None = None, confirm=lambda *_: None, *, calibrated=False,
+               **options) -> Runner:
+        task = Task(self.limits, request or ExcitationRequest(periods=2), {}, calibrated=calibrated)
         return Runner(self.drive, lambda _: task, self.log, self.stop_request, self.display, confirm, **options)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.drive import Mode, PowerState
+from drivers.drive import Mode, Outcome, PowerState
 from drivers.errors import LimitHit, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.runner.settings import ExcitationRequest
@@ -65,6 +65,23 @@ def test_a_refused_preflight_moves_nothing_and_says_how_to_mend_it(world):
     assert asked == []
     assert here.drive.cycles == 0
     assert_nothing_moved(here, result)
+
+
+@pytest.mark.parametrize(
+    ("position_period_s", "calibrated", "rows"),
+    [(None, False, ["torque scale", "speed scale"]), (0.02, False, ["torque scale"]), (None, True, ["speed scale"]),
+     (0.02, True, [])],
+)
+def test_preflight_names_each_scale_that_no_report_can_contradict(world, position_period_s, calibrated, rows):
+    class Positioned(FakeDrive):
+        def preflight(self, limits):
+            return replace(super().preflight(limits), position_period_s=position_period_s)
+
+    here = world(Positioned(speed=1.0, coulomb=0.0, viscous=0.0))
+    here.runner(calibrated=calibrated).run()
+    (preflight,) = here.display.preflights
+    assert [check.name for check in preflight.checks if check.outcome is Outcome.NOTE] == rows
+    assert preflight.refused == ()
 
 
 @pytest.mark.parametrize(
