@@ -128,6 +128,11 @@ SUBJECTS = {
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_speed_changes _calm _coast"
     ),
+    "braking_probe": _run("stages/braking_probe", "test_braking_probe.py", "test_brake_pulse.py"),
+    "impedance": _run("stages/impedance", "test_impedance_run.py"),
+    "virtual_string": _run("stages/virtual_string", "test_virtual_string.py"),
+    **{f"{bus}/scan": Subject(f"drivers/{bus}/scan.py", ("path/test_scan.py", "drivers/test_modbus_pdu.py"))
+       for bus in ("canopen", "modbus")},
     "canopen/drive": _driver(
         "canopen/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
         "test_feedback.py", "test_sdo_feedback.py", "test_other_master.py", "test_supervision.py", "test_position.py",
@@ -265,6 +270,10 @@ SUBJECTS = {
     "service/run_state": _service("run_state", "test_run_state.py", "test_lost_run.py"),
     "service/store": _service("store", "test_store.py", "test_supervisor.py"),
     "service/start_request": _service("start_request", "test_attended.py", "test_supervisor.py", "test_api.py"),
+    "session/open_drive": Subject(
+        "tdhil/session/open_drive.py", ("path/test_hopeless_plan.py", "api/test_front_door.py")),
+    "session/connection": Subject(
+        "tdhil/session/connection.py", ("session/test_modbus_options.py", "session/test_bus_options.py")),
     "session/drive_lock": Subject("tdhil/session/drive_lock.py", ("session/test_drive_lock.py",)),
     "session/confirm": Subject(
         "tdhil/session/confirm.py",
