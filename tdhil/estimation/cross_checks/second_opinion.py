@@ -30,6 +30,7 @@ from tdhil.estimation.cross_checks.momentum_fit import (
     Resolution,
     fit_momentum,
 )
+from tdhil.estimation.cross_checks.run_up import run_up_inertia
 from tdhil.estimation.cross_checks.speed_loop import speed_loop
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
@@ -45,7 +46,9 @@ _WORTH_A_FIT = 0.005
 
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
 _CONTRADICTION = 1e-3
-"""Probability of withdrawing a sound result, given noise and undetected nonlinear friction."""
+"""Probability of withdrawing a sound result, given noise and undetected nonlinear friction: once for the balances of
+the run, once for its run-up.
+"""
 
 _ALIKE = 0.05
 """Share of J: a smaller difference does not count. Friction drifts between stages by a few percent of J's torque."""
@@ -89,6 +92,9 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
             opinions = (replace(opinions[0], least_scale_change=hidden), *opinions[1:])
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, confidence)
+    if not contradiction.reason:
+        # a scale that changes after the run-up of stage 2 changes J and all later balances alike
+        contradiction = _contradiction(run_up_opinion(case, finding), finding, confidence)
     if contradiction.reason:
         # a withdrawn J gets no further figures, as for residuals that contradict the model
         finding = finding.taken_back(contradiction)
@@ -133,6 +139,30 @@ def _fitted_opinions(case: Case, finding: Finding, *, alone: bool = False) -> Fi
         (replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, finding, case.options.confidence, share)), fit)
         for opinion, fit in opinions
     )
+
+
+def run_up_opinion(case: Case, finding: Finding) -> Fitted:
+    """Return J by the run-up of stage 2; () above a drill string, for a compliant shaft, and without known lags. Never
+    raises.
+    """
+    speed, torque, skew = finding.speed_lag_s, finding.torque_lag_s, finding.skew_s
+    delay = known_delay(case.recording, finding)
+    if speed is None or torque is None or skew is None or not delay.known:
+        return ()
+    if case.levels is None or case.recording.has_drill_string or finding.compliant is not None:
+        return ()
+    confidence = case.options.confidence
+    lags_s = (max(speed.value - skew.value, 0.0), max(torque.value, 0.0))
+    density = Density(case.levels.density, case.levels.dof)
+    try:
+        fit = run_up_inertia(
+            case.recording, case.samples, lags_s, delay, density, confidence, _reading(case, finding))
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
+        return ()
+    if fit is None or not fit.half_width < _OPEN * fit.inertia:
+        return ()
+    own = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
+    return ((SecondOpinion("run-up of stage 2", own, _agrees(own, finding, confidence, _CONTRADICTION), ""), fit),)
 
 
 def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Refusal:

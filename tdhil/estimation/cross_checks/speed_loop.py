@@ -52,10 +52,10 @@ def speed_loop(recording: Recording, samples: Samples, speed_lag_s: float) -> Sp
         return None
     interval_s = usual_interval(part.time_s)
     start, end = (float(np.mean(x)) for x in (part.speed_rad_s[:before], part.speed_rad_s[after:]))
-    torque = _lagged(part.torque_nm, interval_s, speed_lag_s)
+    torque = lagged(part.torque_nm, interval_s, speed_lag_s)
     widths = np.diff(part.time_s)
     number = np.arange(len(part)) - before + 1
-    rising = _lagged(np.maximum(number, 0.0), interval_s, speed_lag_s)
+    rising = lagged(np.maximum(number, 0.0), interval_s, speed_lag_s)
 
     def fitted(steps: int) -> tuple[float, FloatArray, FloatArray]:
         """Return residual, (T_0, gains) and design for a setpoint that rises in ``steps`` steps: one rise less a
@@ -98,7 +98,7 @@ def _ends(recording: Recording) -> tuple[Level, Level] | None:
     return (low, high) if low is not None and high is not None else None
 
 
-def _lagged(signal: FloatArray, interval_s: float, lag_s: float) -> FloatArray:
+def lagged(signal: FloatArray, interval_s: float, lag_s: float) -> FloatArray:
     """Return the signal behind a first-order lag, from sample to sample; its delay is that of the lag."""
     if not lag_s > 0.0:
         return signal
