@@ -20,10 +20,11 @@ def closed(log):
         return False
 
 
-ONCE_BELIEVED = (746, 856, 2130, 2264, 3730, 4889, 4980, 5087, 5089)
+ONCE_BELIEVED = (746, 856, 2130, 2147, 2264, 3730, 4889, 4980, 5087, 5089)
 """746: the sensor is lost in the stop above a string; a stiffer release calmed the torque: disabled at 2.4 rad/s.
 856: a sign that changes above a string; believed again while the shaft ran out, the speed control drove it to 42 rad/s.
 2130, 2264: a sensor whose scale halves or doubles within stage 2 above a string: J doubled or halved, and valid.
+2147: a sensor whose scale halves in speed mode at low speed: 80 s at twice the speed, 18.8 of 10 rad/s.
 3730: a coarse speed report beside a position that the stop read too seldom to use: disabled at 0.33 rad/s.
 4889: a torque constant that halves within stage 2 doubled J above a string of known size, and valid.
 4980: a torque constant that loses a tenth above a string: J was as wrong, and no text said that this stays hidden.
