@@ -165,8 +165,8 @@ class SecondOpinion:
 
     ``route``: speed change, coast-down, torque steps. ``agrees``: its interval and that of the result overlap as two
     independent intervals of this confidence should; None without a result to compare with. ``least_scale_change``:
-    smallest relative change of a signal's scale at stage 5 that would contradict J; None if unknown. Above a string
-    without a result to compare with, that of the torque scale, from the mean torques.
+    smallest relative change of a signal's scale during the run that would contradict J in 95 of 100 runs; None if
+    unknown. Above a string without a result to compare with, that of the torque scale, from the mean torques.
     """
 
     route: str

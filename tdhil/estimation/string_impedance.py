@@ -13,6 +13,7 @@ import numpy as np
 
 from tdhil.estimation.case import Case, PeriodicCase
 from tdhil.estimation.frequency_domain import (
+    ANY_IMPEDANCE,
     DELAY_SURER,
     LOAD,
     GaussianPrior,
@@ -32,8 +33,6 @@ from tdhil.estimation.samples import usable_samples
 from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe, Recording
 
-_ANY_IMPEDANCE = 1.0
-"""Relative standard deviation of the prior of ζ: so wide that the data decide."""
 _WIDER = 3.0
 """Factor on the stated uncertainty of the travel time. The prior selects among the oscillations of the string, and
 measures nothing.
@@ -81,7 +80,7 @@ def measure_lines(
     known = replace(pipe, rel_sd=DELAY_SURER * _WIDER * delay_rel_sd)
     try:
         near = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
-        fit = fit_compliant(KnownStringShaft(known, _ANY_IMPEDANCE), lines, constraint, priors, fixed, near)
+        fit = fit_compliant(KnownStringShaft(known, ANY_IMPEDANCE), lines, constraint, priors, fixed, near)
         if rejects(fit.residual) or not plausible(fit):
             raise Refused("the data contradict a string with the travel time of this pipe", _ADVICE)
         value = estimate(viewed(fit.fitted, string_view(exponent)), LOAD, confidence)

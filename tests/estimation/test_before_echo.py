@@ -1,5 +1,6 @@
 """A string on bottom: its impedance before and after an echo, scatter that isn't any, and the inertia above it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +74,14 @@ def test_the_inertia_is_covered(record):
     assert found.inertia.high - found.inertia.low < 0.4 * PLANT.motor
     assert any("almost no echo returns within 1.40 s" in one for one in found.inertia.conditional_on)
     assert {line.source for line in found.budget} >= {"noise", "echo", "string", "lags", "torque scale"}
+
+
+@pytest.mark.heavy
+def test_a_torque_scale_that_is_wrong_shows_in_the_impedance_of_the_pipe(record):
+    """J would be wrong by the same factor (lie 4891 of `sim_bus.lying_runs`)."""
+    found = identify(replace(record, torque_nm=2.0 * record.torque_nm, torque_answer=None))
+    assert (found.verdict, found.inertia) == (Verdict.MODEL_REJECTED, None)
+    assert re.search(r"the string has [\d.]+ times the characteristic impedance of the pipe", found.reason)
 
 
 def test_however_long_the_bottom_takes_to_answer():

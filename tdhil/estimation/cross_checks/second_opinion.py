@@ -50,6 +50,9 @@ _CONTRADICTION = 1e-3
 the run, once for its run-up.
 """
 
+_DETECTED = 0.95
+"""Probability with which a change of scale of the stated size contradicts J."""
+
 _ALIKE = 0.05
 """Share of J: a smaller difference does not count. Friction drifts between stages by a few percent of J's torque."""
 
@@ -73,28 +76,31 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
                        for opinion, fit in _fitted_opinions(earlier, finding, alone=True))
     against = (*fitted, *before)
     reference, confidence = reference_inertia(finding), case.options.confidence
+    run_up = run_up_opinion(case, finding)
     if opinions and before and reference is not None and reference.finite and reference.value > 0.0:
-        # the least change of a signal's scale at stage 5 that would contradict J
-        own = _bent_by(before[0][0].inertia_kg_m2, before[0][1], confidence)
-        half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
-        least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / len(against)) * half / reference.value)
-        note = f"{opinions[0].note}; detects a change of scale of ±{least:.0%} or more at stage 5"
-        opinions = (replace(opinions[0], note=note, least_scale_change=least), *opinions[1:])
+        shown = [(stage, _least_scale_change(found[0], len(group), reference, confidence))
+                 for stage, group, found in (("5", against, before), ("2", run_up, run_up)) if found]
+        words = ", ".join(f"of ±{least:.0%} or more at stage {stage}" for stage, least in shown)
+        opinions = (replace(
+            opinions[0], note=f"{opinions[0].note}; detects a change of scale {words}",
+            least_scale_change=max(least for _, least in shown)), *opinions[1:])
     elif (case.recording.has_drill_string and finding.inertia is not None
             and all(one.agrees is None for one in opinions)):
         # no momentum balance can be compared with J
         hidden = least_torque_scale_change(case.recording, case.samples)
-        amount = "" if hidden is None else f" of less than {hidden:.0%}"
+        what = ("no change in the scale of torque or speed" if hidden is None else
+                f"no change of less than {hidden:.0%} in the scale of torque or speed after stage 2, and none "
+                "within it")
         warnings = (*warnings, CodedText(
-            f"this run does not show a change{amount} in the scale of torque or speed. If a scale changed, J has an "
-            "error of that size", MessageCode.SCALE_CHANGE_HIDDEN))
+            f"this run shows {what}. If a scale changed, J has an error of that size",
+            MessageCode.SCALE_CHANGE_HIDDEN))
         if opinions and hidden is not None:
             opinions = (replace(opinions[0], least_scale_change=hidden), *opinions[1:])
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, confidence)
     if not contradiction.reason:
         # a scale that changes after the run-up of stage 2 changes J and all later balances alike
-        contradiction = _contradiction(run_up_opinion(case, finding), finding, confidence)
+        contradiction = _contradiction(run_up, finding, confidence)
     if contradiction.reason:
         # a withdrawn J gets no further figures, as for residuals that contradict the model
         finding = finding.taken_back(contradiction)
@@ -188,6 +194,20 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 "the run", entry=MessageCode.METHODS_CONTRADICT,
             )
     return Refusal("", "")
+
+
+def _least_scale_change(
+    found: tuple[SecondOpinion, MomentumFit], count: int, reference: Estimate, confidence: float
+) -> float:
+    """Return the least relative change of a signal's scale that would contradict J with a probability of `_DETECTED`.
+
+    ``count``: number of comparisons that share the probability of a false contradiction. The detection limit as in
+    ISO 11843-1: the limit of the comparison, and above it the part of the noise that may hide the change.
+    """
+    own = _bent_by(found[0].inertia_kg_m2, found[1], confidence)
+    half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low)) / reference.value
+    hides = student_quantile(2.0 * _DETECTED - 1.0, 1e6) / student_quantile(confidence, 1e6)
+    return max(_ALIKE, _times_wider(confidence, _CONTRADICTION / count) * half) + hides * half
 
 
 def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:

@@ -33,9 +33,8 @@ from tdhil.estimation.frequency_domain.rigid import (
     simultaneous as simultaneous, unfiltered as unfiltered,
 )
 from tdhil.estimation.frequency_domain.shafts import (
-    DELAY_SURER as DELAY_SURER, KnownStringShaft as KnownStringShaft, LOAD as LOAD, ShaftModel as ShaftModel,
-    TwoMassShaft as TwoMassShaft,
-    VISCOUS as VISCOUS, shaft_model as shaft_model,
+    ANY_IMPEDANCE as ANY_IMPEDANCE, DELAY_SURER as DELAY_SURER, KnownStringShaft as KnownStringShaft, LOAD as LOAD,
+    ShaftModel as ShaftModel, TwoMassShaft as TwoMassShaft, VISCOUS as VISCOUS, shaft_model as shaft_model,
 )
 from tdhil.estimation.frequency_domain.signal_filters import (
     AVERAGE as AVERAGE, LAG_BOUND_S as LAG_BOUND_S, SHAPE_BOUND as SHAPE_BOUND, SKEW as SKEW,

@@ -28,7 +28,8 @@ import numpy as np
 from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
+from tdhil.estimation.frequency_domain.compliant_fit import chance_gain
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model, likeliest
 from tdhil.estimation.frequency_domain.frequency_response import ModelCurve
 from tdhil.estimation.frequency_domain.inference import (
     estimate,
@@ -39,7 +40,13 @@ from tdhil.estimation.frequency_domain.inference import (
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.rigid import fitted_points, known_structure, lag_priors, lags_of, of_reports
-from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.estimation.frequency_domain.shafts import (
+    ANY_IMPEDANCE,
+    INERTIA,
+    VISCOUS,
+    like_the_pipe,
+    unlike_the_pipe,
+)
 from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest, rejects
 from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, downhole_swing_rad_s, repeats
 from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, pooled_lines
@@ -58,13 +65,17 @@ _LATE_S = 3.0             # s after the echo; from then on the instants are fart
 _LASTS_S = 16.0           # s after the echo; duration of its response
 _UNEVEN = 0.01              # sd of r before the echo
 _TOP_SHARE = 0.05           # sd of the friction at the top, as a share of ζ
+_HELD, _FREE = (0.5, 2.0), (0.1, 10.0)     # least and greatest ζ of the fit over that of the pipe
 _MOST = 5.0                 # largest |r|: five times the prior's sd or more, so that the prior holds r
 
 
 class EchoShaft:
     """J (kg·m²), B, ζ (N·m·s/rad), r_1 … r_N. The priors are ζ, to the pipe's tolerance, and the size of r."""
 
-    def __init__(self, pipe: Pipe, fastest_hz: float) -> None:
+    def __init__(self, pipe: Pipe, fastest_hz: float, impedance_rel_sd: float | None = None) -> None:
+        """Set the pipe. ``impedance_rel_sd``: of ζ, instead of the pipe's."""
+        rel_sd = pipe.rel_sd if impedance_rel_sd is None else impedance_rel_sd
+        self._range = _HELD if impedance_rel_sd is None else _FREE
         half_s = 0.5 / fastest_hz
         self.echo_s = _FASTER * 2.0 * pipe.delay_s
         late_s, end_s = self.echo_s + _LATE_S, self.echo_s + _LASTS_S
@@ -78,9 +89,9 @@ class EchoShaft:
         self.names = ("inertia", "viscous", "resistance", *(f"echo_{n}" for n in range(len(self.at_s))))
         self.inertia_row, self.viscous_row = np.eye(2, len(self.names))
         zeta = pipe.impedance_nm_s_rad
-        sd = np.concatenate([[_TOP_SHARE * zeta, pipe.rel_sd * zeta], size])
+        sd = np.concatenate([[_TOP_SHARE * zeta, rel_sd * zeta], size])
         self._beliefs: FloatArray = np.eye(len(self.names))[VISCOUS:] / sd[:, None]
-        self._believed: FloatArray = np.eye(len(sd))[1] / pipe.rel_sd
+        self._believed: FloatArray = np.eye(len(sd))[1] / rel_sd
         self._delayed: tuple[ComplexArray, ComplexArray] | None = None
 
     def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -97,8 +108,9 @@ class EchoShaft:
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
         zeta, most = self.pipe.impedance_nm_s_rad, np.full(len(self.at_s), _MOST)
-        return (np.concatenate([[1e-6 * rough_inertia, -np.inf, 0.5 * zeta], -most]),
-                np.concatenate([[1e6 * rough_inertia, np.inf, 2.0 * zeta], most]))
+        lowest, highest = self._range
+        return (np.concatenate([[1e-6 * rough_inertia, -np.inf, lowest * zeta], -most]),
+                np.concatenate([[1e6 * rough_inertia, np.inf, highest * zeta], most]))
 
     def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
         zeta = self.pipe.impedance_nm_s_rad
@@ -200,6 +212,12 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
     )
     if rejects(residual):
         return replace(finding, compliant=None)
+    free = fit_before_echo(problem_of(lines, pipe, case.recording.lag_prior, answer, ANY_IMPEDANCE),
+                           case.recording.lag_prior)
+    ratio = float(free.likelier.theta[RESISTANCE]) / pipe.impedance_nm_s_rad
+    likelier = likeliest(fitted) - likeliest(free) > chance_gain() and not rejects(residual_of(free))
+    if likelier and not like_the_pipe(ratio):
+        return replace(finding, compliant=None, contradiction=unlike_the_pipe(ratio))
     inertia = estimate(fitted, INERTIA, confidence)
     if not (inertia.bounded and inertia.low > 0.0):
         raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide,
@@ -223,15 +241,17 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
 
 
 def problem_of(
-    lines: tuple[SpectralLine, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None
+    lines: tuple[SpectralLine, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None,
+    impedance_rel_sd: float | None = None,
 ) -> Likelihood:
     """Return the likelihood. ``answer``: the response of the torque, used if no lag of it is stated.
+    ``impedance_rel_sd``: of ζ, instead of the pipe's.
 
     Raises Refused if the lines are too few, or too far apart to separate an echo from the time before it.
     """
     hertz = [line.hertz for line in lines]
     apart = float(np.max(np.diff(hertz))) if len(hertz) > 1 else math.inf
-    shaft = EchoShaft(pipe, max(hertz, default=1.0))
+    shaft = EchoShaft(pipe, max(hertz, default=1.0), impedance_rel_sd)
     if not 1.0 / apart >= shaft.echo_s + _LASTS_S:
         raise Refused(
             f"the lines are {apart:.3g} Hz apart. An echo after {shaft.echo_s:.2f} s needs lines at most "

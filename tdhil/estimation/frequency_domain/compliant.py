@@ -31,7 +31,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     intervals,
     shaft_covariance,
 )
-from tdhil.estimation.frequency_domain.filter_order import excess_rise
+from tdhil.estimation.frequency_domain.filter_order import likeliest
 from tdhil.estimation.frequency_domain.frequency_response import ModelCurve
 from tdhil.estimation.frequency_domain.inference import (
     fisher_tail,
@@ -52,6 +52,7 @@ from tdhil.estimation.frequency_domain.rigid import (
     whose_load_may_stay_behind,
 )
 from tdhil.estimation.frequency_domain.shafts import (
+    ANY_IMPEDANCE,
     DAMPING,
     DRAG_SHARE,
     INERTIA,
@@ -67,7 +68,9 @@ from tdhil.estimation.frequency_domain.shafts import (
     ShaftModel,
     StringShaft,
     TwoMassShaft,
+    like_the_pipe,
     shaft_model,
+    unlike_the_pipe,
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.result import DOUBT_P, REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
@@ -95,11 +98,6 @@ _REPORTS = 3                 # unknowns besides the shaft: two lags and the skew
 _BY_PIPE = 2                 # parameters known with a known pipe: its inertia and its stiffness
 _SIGNIFICANT = 25.0          # |mean|² over its variance, as in `SpectralLine.excited`
 _LEAST_LOAD = 0.01           # of the total: a smaller load depends on the error of one line
-_ANY_IMPEDANCE = 1.0         # relative sd of ζ, so wide that the data decide
-_PIPE_RATIOS = (0.75, 1.33)
-"""Allowed ratios of ζ to that of the pipe, for waves with the pipe's travel time. G of 61 instead of 79 GPa gives
-0.88; worn pipe and the torque scale change the ratio by a tenth. A ratio outside means a wrong scale or a wrong
-section."""
 _NEAR = (SLOWEST_SEEN, 2.0)  # visible oscillations: multiples of the lowest and the highest line
 
 
@@ -198,7 +196,7 @@ def _try_pipe(standing: _LoadWalk) -> _LoadWalk:
     if not rejects(known.residual) and plausible(known):
         # few lines with undocumented filters may hide a wrong impedance in their residuals
         scaled, ratio = _scaled_pipe(standing, near)
-        if not _likeliest(known) - _likeliest(scaled) > chance_gain():
+        if not likeliest(known.fitted) - likeliest(scaled.fitted) > chance_gain():
             ratio = None
         return replace(standing, chosen=Chosen(known, pipe=standing.pipe, impedance_ratio=ratio), ended=True)
     return replace(standing.with_pipe(None), near=near, contradicted=True)
@@ -230,7 +228,7 @@ def _try_string(standing: _LoadWalk) -> _LoadWalk:
     # structure of lags that it needs: with filters of two poles and averages, two masses may imitate a string with
     # first-order lags. These parameters are counted.
     if (two is not None and not rejects(two.residual)
-            and not _likeliest(two) - _likeliest(string) > chance_gain()):
+            and not likeliest(two.fitted) - likeliest(string.fitted) > chance_gain()):
         return replace(standing, chosen=Chosen(two, string, rejected=not plausible(two)))
     return replace(standing, chosen=Chosen(string, rejected=rejects(string.residual) or not plausible(string)))
 
@@ -248,11 +246,10 @@ def _scaled_pipe(standing: _LoadWalk, near: CompliantFit | None) -> tuple[Compli
     The ratio is None within its allowed range, or if that string is contradicted, too.
     """
     assert standing.pipe is not None
-    scaled = KnownStringShaft(standing.pipe, _ANY_IMPEDANCE)
+    scaled = KnownStringShaft(standing.pipe, ANY_IMPEDANCE)
     fit = standing.fitted(scaled, near)
     ratio = scaled.impedance_ratio(fit.mechanical)
-    least, most = _PIPE_RATIOS
-    found = not rejects(fit.residual) and plausible(fit) and not least <= ratio <= most
+    found = not rejects(fit.residual) and plausible(fit) and not like_the_pipe(ratio)
     return fit, ratio if found else None
 
 
@@ -311,17 +308,6 @@ def _by_difference(line: SpectralLine) -> SpectralLine:
         return line
     return replace(line, s_ww=ratio * line.s_ww, s_tt=ratio * line.s_tt, s_tw=ratio * line.s_tw,
                    nu=max(float(free), _LEAST_NU))
-
-
-def _likeliest(fit: CompliantFit) -> float:
-    """Return −2 ln L with first-order lags, or of the whole family plus Schwarz's penalty for its structure
-    (`filter_order`).
-    """
-    fitted = fit.fitted
-    price = len([index for index in fitted.problem.model.structure if index not in fitted.fixed])
-    rise = excess_rise(fitted.problem, len(fitted.free))
-    whole = fitted.whole.objective + rise * price * math.log(fitted.problem.numbers)
-    return min(fitted.simple.objective, whole)
 
 
 def may_swing(rigid: RigidResult) -> bool:
@@ -596,17 +582,9 @@ def _stands(chosen: Chosen, result: CompliantResult, case: PeriodicCase, rigid: 
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if chosen.impedance_ratio is not None:
         # a J that does not stand gets no further figures, as for residuals that contradict the model
-        least, most = _PIPE_RATIOS
         return Finding(
             model=name, words=finding.words, residual=fit.residual, lines=finding.lines, curve=finding.curve,
-            contradiction=Refusal(
-                f"the string has {chosen.impedance_ratio:.2f} times the characteristic impedance of the pipe in"
-                f" rig.yaml (limits {least:g} to {most:g}), and its travel time is that of the pipe: the scale of"
-                " torque or speed is wrong by this factor, or the pipe's diameters are",
-                "compare the diameters in rig.yaml with the pipe, and the rated torque and the speed unit with the"
-                " drive; then run it again",
-                MessageCode.STRING_IMPEDANCE_DIFFERS,
-            ))
+            contradiction=unlike_the_pipe(chosen.impedance_ratio))
     if result.inertia.bounded:
         words = replace(finding.words, if_wide=_WHICH) if result.by_model else finding.words
         return replace(finding, inertia=result.inertia, budget=result.budget, words=words)

@@ -125,6 +125,14 @@ def excess_rise(problem: Likelihood, fitted: int) -> float:
     return 1.0 + (fitted - problem.held) / (4.0 * max(nu, 1.0))
 
 
+def likeliest(fitted: FittedModel) -> float:
+    """Return −2 ln L with first-order lags, or of the whole family plus Schwarz's penalty for its structure."""
+    price = len([index for index in fitted.problem.model.structure if index not in fitted.fixed])
+    rise = excess_rise(fitted.problem, len(fitted.free))
+    whole = fitted.whole.objective + rise * price * math.log(fitted.problem.numbers)
+    return min(fitted.simple.objective, whole)
+
+
 def unit(fitted: FittedModel, index: int) -> FloatArray:
     """Return the row (P,) that selects one parameter."""
     row = np.zeros(fitted.problem.model.size)

@@ -10,7 +10,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from profiles import MessageCode
 from tdhil.config import MODELS, load
+from tdhil.estimation.result import Refusal
 from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Pipe
 
@@ -279,6 +281,32 @@ class KnownStringShaft(StringShaft):
         off = np.array([0.5 * (inertia + spring), 0.5 * (inertia - spring)]) / sds
         slopes = np.stack([0.5 * (by_inertia + by_spring), 0.5 * (by_inertia - by_spring)]) / sds[:, None]
         return off, slopes
+
+
+ANY_IMPEDANCE = 1.0
+"""Relative standard deviation of the prior of ζ: so wide that the data decide."""
+_PIPE_RATIOS = (0.75, 1.33)
+"""Allowed ratios of ζ to that of the pipe, for waves with the pipe's travel time. G of 61 instead of 79 GPa gives
+0.88; worn pipe and the torque scale change the ratio by a tenth. A ratio outside means a wrong scale or a wrong
+section."""
+
+
+def like_the_pipe(impedance_ratio: float) -> bool:
+    """Return whether a string with this ratio of ζ to that of the pipe may be the pipe."""
+    return _PIPE_RATIOS[0] <= impedance_ratio <= _PIPE_RATIOS[1]
+
+
+def unlike_the_pipe(impedance_ratio: float) -> Refusal:
+    """Return the contradiction of a string with this ratio of ζ to that of the pipe."""
+    least, most = _PIPE_RATIOS
+    return Refusal(
+        f"the string has {impedance_ratio:.2f} times the characteristic impedance of the pipe in rig.yaml (limits"
+        f" {least:g} to {most:g}), and its travel time is that of the pipe: the scale of torque or speed is wrong by"
+        " this factor, or the pipe's diameters are",
+        "compare the diameters in rig.yaml with the pipe, and the rated torque and the speed unit with the drive; then"
+        " run it again",
+        MessageCode.STRING_IMPEDANCE_DIFFERS,
+    )
 
 
 DELAY_SURER = 3.0
