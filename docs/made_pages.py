@@ -5,6 +5,7 @@
 | reference/command-line.md | the parsers of `tdhil.cli` |
 | reference/candidates.md | the table of `tdhil.estimation.candidates` |
 | reference/drives.md | the archives in `evidence/` |
+| reference/figures.md | the table of `tdhil.report.figure_words` |
 | reference/exit-codes.md | `tdhil.errors.ExitCode` and the tree of errors |
 | reference/http-api.md | the OpenAPI document of `tdhil serve` |
 """
@@ -217,6 +218,18 @@ MEANING = {
 """Exit code → what it means, what to do."""
 
 
+def figures() -> str:
+    """The page of the figures of tune soft-torque, severity and evaluate."""
+    from tdhil.report.figure_words import FIGURES
+
+    rows = (f"| {_cell(', '.join((one.name, *one.also)))} | {_cell(one.words)} |" for one in FIGURES)
+    out = [MADE + "# Figures of soft torque", "",
+           "The cards and pages of `tdhil tune soft-torque`, `severity` and `evaluate` show these figures.",
+           "[Soft torque](../explanation/soft-torque.md) describes how they are computed.", "",
+           "| figure | meaning |", "|---|---|", *rows]
+    return "\n".join(out) + "\n"
+
+
 def exit_codes() -> str:
     """The page of the exit codes, with the errors that end with each."""
     from tdhil.errors import ExitCode
@@ -399,7 +412,7 @@ def drives() -> str:
 
 
 PAGES = {"candidates.md": candidates, "command-line.md": command_line, "drives.md": drives, "exit-codes.md": exit_codes,
-         "http-api.md": http_api}
+         "figures.md": figures, "http-api.md": http_api}
 
 if __name__ == "__main__":
     for name, make in PAGES.items():

@@ -25,6 +25,7 @@ from tdhil.report.blocks import (
 )
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import marks, rehearsal_rows, run_facts
+from tdhil.report.figure_words import meanings_section, print_meanings
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
@@ -88,7 +89,11 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
     verdict = document["verdict"]
     head = ("verdict", Words(_CRITICAL_ONLY, style="bold yellow") if _critical_only(document) else
             Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
-    console.print(names_and_texts((head, *_rows(document))))
+    rows = tuple(_rows(document))
+    console.print(names_and_texts((head, *rows)))
+    console.print()
+    names = ("tune", "in brackets", document["controller"]["kind"], head[0], *(name for name, _ in rows))
+    print_meanings(names, console)
 
 
 def _critical_only(document: Part) -> bool:
@@ -184,6 +189,8 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
     sections += [
         ReportSection("Basis of the result", (Pairs(tuple(_rests_on(document))),)),
         ReportSection("Run", (Pairs(tuple(_run(document, sha256))),)),
+        meanings_section(("measured", "tune", "in brackets", document["controller"]["kind"],
+                          *(one[0] for one in (*_beside(document), *_rests_on(document))))),
     ]
     return report_of_run(
         document, "Speed controller on a virtual drill string", facts, _answer(document), sections, sha256)

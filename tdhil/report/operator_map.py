@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.table import Table as Grid
+from rich.text import Text as Words
 
 from tdhil.report.blocks import Column, Picture, ReportSection, Table, Text
 from tdhil.report.console import PlainConsole
+from tdhil.report.figure_words import words_of
 from tdhil.soft_torque import OperatorMap
 
 if TYPE_CHECKING:
@@ -18,11 +20,11 @@ if TYPE_CHECKING:
 
 Part = Mapping[str, Any]
 
+_COLOURED = {"Green": "stable", "Yellow": "at risk", "Red": "stick-slip"}
 HOW_TO_READ = (
     "Find the bit torque or the weight on bit on the left, and the set speed below. "
-    "Green: the bit turns, and comes free if it was stuck. "
-    "Yellow: the bit goes on turning, but does not come free once it is stuck: start at a speed in green, then slow "
-    "down. Red: the bit sticks and slips.")
+    + " ".join(f"{colour}: {words_of(state)}." for colour, state in _COLOURED.items())
+    + " From yellow, raise the set speed into green, then lower it.")
 _COLOURS = {"stable": "#7fbf7f", "at risk": "#f2d16b", "stick-slip": "#d9695f"}
 
 
@@ -50,9 +52,15 @@ def map_section(document: Part, bit: str) -> ReportSection:
     ))
 
 
+def map_figures(document: Part) -> tuple[str, ...]:
+    """Return the names of the columns and of the states."""
+    return (_rows(document)[0], *document["states"], *_COLOURED.values())
+
+
 def print_map(document: Part, console: PlainConsole) -> None:
     """Print the map: for each bit torque, the set speeds in words."""
     title, rows = _rows(document)
+    console.print(Words("set speeds over bit torque; between the two speeds: at risk", style="bold"))
     grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     for name in (title, *document["states"]):
         grid.add_column(name)
@@ -103,4 +111,4 @@ def draw_map(figure: FigureBase, document: Part) -> None:
         every[0].set_ylabel("weight on bit, kN")
 
 
-__all__ = ["HOW_TO_READ", "draw_map", "map_document", "map_section"]
+__all__ = ["HOW_TO_READ", "draw_map", "map_document", "map_figures", "map_section"]

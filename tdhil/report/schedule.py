@@ -132,7 +132,7 @@ def _worst_between(found: DepthSchedule) -> str:
 def print_schedule(document: Part, console: PlainConsole) -> None:
     """Print the table of depths and the worst case of interpolation."""
     console.print(Words(f"gains over depth, {document['kind']}, linear between rows", style="bold"))
-    console.print(figures_table(_headings(document), _table(document), left=0))
+    console.print(figures_table(schedule_headings(document), _table(document), left=0))
     thin = any(one.get("failed") for one in document["between"])
     console.print(Words(document["sentence"], style="bold red" if thin else ""))
     for one in document["rows"]:
@@ -143,7 +143,7 @@ def print_schedule(document: Part, console: PlainConsole) -> None:
 
 def schedule_section(document: Part) -> ReportSection:
     """Return table and figure of the schedule."""
-    headings = _headings(document)
+    headings = schedule_headings(document)
     rows = tuple(tuple(cell.replace("!", "⚠ ") for cell in cells) for cells in _table(document))
     parameters = tuple(
         (f"{one['depth_m']:.0f}", setting["title"], setting_words(setting))
@@ -163,7 +163,8 @@ def _with_gains(document: Part) -> list[Part]:
     return [one for one in document["rows"] if not one["refused"]]
 
 
-def _headings(document: Part) -> list[str]:
+def schedule_headings(document: Part) -> list[str]:
+    """Return the names of the columns."""
     names = ["depth, m", "f₁, Hz", "P, motor", "I, motor"]
     if any(one["at_motor"]["compensated_kg_m2"] for one in _with_gains(document)):
         names.append("J_c, motor")
@@ -174,7 +175,7 @@ def _headings(document: Part) -> list[str]:
 
 
 def _table(document: Part) -> Iterator[list[str]]:
-    names = _headings(document)
+    names = schedule_headings(document)
     for one in document["rows"]:
         cells = [f"{one['depth_m']:.0f}", f"{one['lowest_mode_hz']:.3f}"]
         if one["refused"]:

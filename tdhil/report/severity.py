@@ -18,6 +18,7 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, Repor
 from tdhil.report.card import minutes
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
+from tdhil.report.figure_words import meanings_section, print_meanings
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, BitNoiseEstimate, DrillString, Interval, Severity
 from tdhil.version import __version__
@@ -34,16 +35,6 @@ MOST_EPISODES = 200
 SHOWN_EPISODES = 3
 SHOWN_PERIODS = 12.0
 """Length of the detail figure, in periods."""
-_EXPLAINED = {
-    "severity index": "half of peak to peak of the downhole speed over the mean speed, in windows of one period of the "
-                      f"string's lowest mode; {STICK_SLIP_INDEX:g} and more with a bit that nearly stops is "
-                      f"stick-slip, {AT_RISK_INDEX:g} and more is at risk",
-    "downhole speed": "from torque and speed at the top by the two travelling waves; ± is half of peak to peak",
-    "string torque": "T − J α at the top of the string",
-    "|r|": "share of a wave from below that the top drive sends back: 1 reflects completely, 0 absorbs completely",
-    "bit noise": "random torque of the bit in steady rotation; tdhil tune --bit-noise uses it",
-    "in brackets": "95 % interval over J, length, shear modulus and wear of the string",
-}
 
 
 def severity_document(
@@ -128,9 +119,14 @@ def print_severity(document: Part, console: PlainConsole) -> None:
             grid.add_row(name, *cells)
         console.print(grid)
     console.print()
-    console.print(names_and_texts(_EXPLAINED.items(), quiet=True))
+    print_meanings(_figures(records), console)
     for warning in document["warnings"]:
         console.print(Words(warning, style="yellow"))
+
+
+def _figures(records: Sequence[Part]) -> list[str]:
+    """Return the names of all rows and columns."""
+    return ["in brackets", *(name for name, _ in _rows(records)), *(("before", "after") if len(records) > 1 else ())]
 
 
 def _with(part: Part, digits: int, unit: str = "", sign: str = "") -> str:
@@ -219,14 +215,14 @@ def severity_report(document: Part, found: Sequence[Severity]) -> Report:
         sections=(
             ReportSection("Figures", (Table((Column("", 0.2), *(Column(name, width) for name in names)), rows),)),
             ReportSection("Over time", tuple(pictures)),
-            ReportSection("Meaning of the figures", (Pairs(tuple(_EXPLAINED.items())),)),
             ReportSection("Basis of the result", (Pairs((
                 ("J, main shaft", f"{document['inertia_kg_m2']['value']:.4g} kg·m² "
                  f"({printed_interval(document['inertia_kg_m2']['low'], document['inertia_kg_m2']['high'])})"),
-                ("string", f"ζ {document['string']['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after "
-                 f"{document['string']['echo_s']:.3f} s"),
+                ("ζ", f"{document['string']['impedance_nm_s_rad']:.4g} N·m·s/rad"),
+                ("echo", f"after {document['string']['echo_s']:.3f} s"),
                 *(("record" if len(records) == 1 else name, one["file"])
                   for name, one in zip(names, records, strict=True)))),)),
+            meanings_section((*_figures(records), "J", "ζ", "echo")),
         ),
         footer=f"tdhil {document['tdhil']}",
     )

@@ -15,12 +15,14 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, Repor
 from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import SIMULATED
-from tdhil.report.operator_map import map_section, print_map
+from tdhil.report.figure_words import meanings_section, print_meanings, words_of
+from tdhil.report.operator_map import map_figures, map_section, print_map
 from tdhil.report.schedule import (
     finite,
     gain_words,
     noisy_speed,
     print_schedule,
+    schedule_headings,
     schedule_section,
     settings_section,
     spread_document,
@@ -50,13 +52,6 @@ if TYPE_CHECKING:
 
 Part = Mapping[str, Any]
 
-_WHAT = {
-    "present": "the gains in the drive now: reported by it, measured or typed",
-    "stiff": "the stiffest PI that keeps its phase margin",
-    "soft": "P = ζ/a, I = (φω)² J, with the lowest critical speed that the margins allow",
-    "compensated": "the same, with a part of the rotor's inertia compensated",
-    "broadband": "near ζ over more than one mode, as far as lags and J's interval allow",
-}
 SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
 """Error of a simulated critical speed, rpm and share: half of the search's step, and the effects of the time step
 and of the simulation's length (stiff loop of the reference case: 182 instead of 183)."""
@@ -64,27 +59,10 @@ LIGHT_BIT_ERROR_SHARE = 0.04
 """The share for a bottom end of sections, whose bit has no inertia. The tick of the search gives 75 rpm for 200 m of
 8 inch collars, a chain of masses 78 rpm."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
-_IN_BRACKETS = "95 % interval over J, string, lags and bit drawn together; ψ: over J alone, the string as stated"
 _MEANT = {
     "cure": "lowest set speed at which a stuck bit comes free and turns on, the top at full speed",
     "start": "lowest set speed at which the bit turns after a ramp from standstill",
 }
-_EXPLAINED = {
-    "P, I, J_c": "gains in N·m·s/rad, N·m/rad and kg·m², at the main shaft and at the motor shaft",
-    "critical": "lowest set speed at which a stuck bit comes free and turns on, with noise of the bit",
-    "by ramp": f"the same after a ramp of the set speed from standstill, on {START_DRAWS} of the draws",
-    "linear": "mean speed below which steady rotation is unstable, without noise",
-    "phase margin": "phase that the loop with the string may lose; this and the next two: the least of all sampled "
-                    "machines and strings",
-    "gain margin": "change of all gains that makes the loop unstable; 6 dB is a factor of 2",
-    "dead time": "further dead time in the loop that makes it unstable",
-    "a, φ": "softness and frequency factor: P = ζ/a, I = (φω)² (J − J_c)",
-    "|r|, mean": f"share of a wave that the top reflects (1: completely): at the lowest mode, and over "
-                 f"{BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz",
-    "damping": "damping ratio of the least damped of the lowest modes",
-    "J wrong": "damping and critical speed without noise if J is wrong by as much",
-}
-_OF_SPEEDS = ("critical", "by ramp", "linear")
 
 
 @dataclass(frozen=True)
@@ -326,7 +304,8 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
         print_schedule(document["schedule"], console)
     if document.get("map"):
         print_map(document["map"], console)
-    console.print(names_and_texts(_legend(document), quiet=True))
+    print_meanings(_figures(document), console)
+    console.print()
     for one in document["controllers"]:
         if one["refused"]:
             console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))
@@ -351,20 +330,28 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     yield "lags in the loop", f"{lags} ms, {main['inner_lags_from']}" + (
         f"; together {1e3 * whole['value']:.3g} ({printed_interval(1e3 * whole['low'], 1e3 * whole['high'], 3)}) ms"
         if whole["high"] > whole["low"] else "")
-    yield "string", (f"ζ {string['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after {string['echo_s']:.3f} s, modes at "
-                     + ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz")
-    yield "bit", string["bit"]["words"] if string["bit"] else "not stated; tdhil reports no critical speeds"
+    yield "ζ", f"{string['impedance_nm_s_rad']:.4g} N·m·s/rad"
+    yield "echo", f"after {string['echo_s']:.3f} s"
+    yield "modes", ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz"
+    bit = string["bit"]
+    yield "bit", bit["words"] if bit else "not stated; tdhil reports no critical speeds"
+    if bit:
+        yield "bit noise", f"{bit['noise_nm']:.0f} N·m rms, correlation time {bit['noise_correlation_s']:.2g} s"
     if tuned_for.get("present_from"):
         yield "present gains", tuned_for["present_from"]
     if tuned_for["loop"] == "bus":
         yield "loop", "closed over the bus, in torque mode: the reported speed's lag is in it"
 
 
-def _legend(document: Part) -> Iterator[tuple[str, str]]:
-    """Yield a short explanation of each line of the table."""
-    yield "in brackets", _IN_BRACKETS
-    left_out = () if document["critical_speeds"] is not None else _OF_SPEEDS
-    yield from ((name, words) for name, words in _EXPLAINED.items() if name not in left_out)
+def _figures(document: Part) -> list[str]:
+    """Return the names of all rows and columns of the card and the page."""
+    names = [name for name, _ in (*_rests_on(document), *_rows(document))]
+    names += ["in brackets", "ψ", "draws", *(one["kind"] for one in document["controllers"])]
+    if document.get("schedule"):
+        names += schedule_headings(document["schedule"])
+    if document.get("map"):
+        names += map_figures(document["map"])
+    return names
 
 
 def _interval(part: Part, digits: int = 2) -> str:
@@ -488,7 +475,6 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         ReportSection("Controllers", (
             Table((Column("", 0.24), *(Column(one["kind"], 0.76 / max(1, len(taken)), number=True) for one in taken)),
                   tuple((name, *(cell.replace("!", "⚠ ") for cell in cells)) for name, cells in _rows(document))),
-            Pairs(tuple((one["kind"], _WHAT[one["kind"]]) for one in taken)),
             *(Text(f"{one['kind']}: thin margins, {', '.join(one['margins']['failed'])}.") for one in taken
               if one["margins"] and one["margins"]["failed"]),
             *(Text(f"{one['kind']} refused: {one['refused']}") for one in document["controllers"] if one["refused"]),
@@ -518,8 +504,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         sections.append(schedule_section(document["schedule"]))
     rests: list[tuple[str, str]] = list(_rests_on(document))
     rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
-    rests += _legend(document)
-    sections.append(ReportSection("Basis of the result", (Pairs(tuple(rests)),)))
+    sections += [ReportSection("Basis of the result", (Pairs(tuple(rests)),)), meanings_section(_figures(document))]
     simulated = document["tuned_for"]["simulated"]
     return Report(
         title="Speed controller and drill string",
@@ -542,7 +527,7 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
             headline, verdict = "No gains are recommended", "critical speeds not compared"
         return AnswerBox("red" if thin else "yellow", headline, lines, verdict, sentence, "")
     gains = best["at_motor"]
-    remarks = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
+    remarks = [f"at the motor shaft; {best['kind']}: {words_of(best['kind'])}"]
     if gains["compensated_kg_m2"]:
         remarks.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
                      f"{1e3 * gains['derivative_filter_s']:g} ms")

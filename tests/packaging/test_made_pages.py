@@ -23,7 +23,8 @@ def made():
     return module
 
 
-@pytest.mark.parametrize("name", ["candidates.md", "command-line.md", "drives.md", "exit-codes.md", "http-api.md"])
+@pytest.mark.parametrize("name", ["candidates.md", "command-line.md", "drives.md", "exit-codes.md", "figures.md",
+                                  "http-api.md"])
 def test_the_page_is_what_the_code_makes_of_it(made, name):
     if name == "http-api.md":
         pytest.importorskip("jinja2", reason="jinja2 is not installed (pip install '.[service]')")

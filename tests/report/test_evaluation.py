@@ -25,7 +25,8 @@ def test_the_page_has_both_columns_and_the_pictures(tmp_path):
     page = evaluation_report(document(log), log)
     assert page.answer.colour == "green" and "57.2 rpm" in page.answer.value
     headings = [section.heading for section in page.sections]
-    assert headings == ["Measured and predicted by tune", "Bit and top drive", "Trials", "Basis of the result", "Run"]
+    assert headings == ["Measured and predicted by tune", "Bit and top drive", "Trials", "Basis of the result", "Run",
+                        "Meaning of the figures"]
     critical, damping, sticking, *_ = page.sections[0].blocks[0].rows
     assert critical[1:] == ("57.2, above 56.3", "57 (56 to 59)")
     assert damping[1].startswith("0.220") and damping[2] == "0.226 (0.213 to 0.240)"

@@ -1,0 +1,125 @@
+"""Meaning of every figure on the cards and pages of tune soft-torque, severity and evaluate.
+
+Each figure is explained here once. Terminal, page and docs/reference/figures.md show the same words.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from rich.text import Text as Words
+
+from tdhil.report.blocks import Pairs, ReportSection, Text
+from tdhil.report.console import PlainConsole, names_and_texts
+from tdhil.soft_torque import AT_RISK_INDEX, BAND_HZ, START_DRAWS, STICK_SLIP_INDEX
+
+HEADING: Final = "Meaning of the figures"
+MORE: Final = "docs/reference/figures.md"
+"""Page with all figures. `tdhil docs` prints its folder."""
+
+
+@dataclass(frozen=True)
+class FigureMeaning:
+    """A figure with its meaning. ``also``: other names of the same figure on a card or a page."""
+
+    name: str
+    words: str
+    also: tuple[str, ...] = ()
+
+
+FIGURES: Final = (
+    FigureMeaning("in brackets", "95 % interval over J and the other tolerances"),
+    FigureMeaning("draws", "machines and strings, drawn at random within tolerances"),
+    FigureMeaning("ψ", "interval over J alone, the string as stated"),
+    FigureMeaning("J", "moment of inertia of the top drive", ("meant",)),
+    FigureMeaning("lags in the loop", "delays inside the speed loop: filter, torque loop, sampling"),
+    FigureMeaning("loop", "place of the speed loop: in the drive, or in a host"),
+    FigureMeaning("ζ", "impedance of the pipe: torque of a wave over its speed"),
+    FigureMeaning("echo", "time of a wave from the top down to the bit and back"),
+    FigureMeaning("modes", "frequencies of torsional vibration with the top held", ("f₁",)),
+    FigureMeaning("bit", "its friction: at standstill, turning fast, and between"),
+    FigureMeaning("bit noise", "random torque of the bit, root mean square"),
+    FigureMeaning("present gains", "source of the gains in the column present"),
+    FigureMeaning("present", "the gains in the drive now"),
+    FigureMeaning("stiff", "the stiffest PI with the phase margin of --phase-margin"),
+    FigureMeaning("soft", "PI that absorbs waves; lowest critical speed in the margins"),
+    FigureMeaning("compensated", "soft, and a part of J is compensated"),
+    FigureMeaning("broadband", "absorbs waves of more than one mode"),
+    FigureMeaning("depth", "depth of the well: the topmost section gets longer"),
+    FigureMeaning("P, I, J_c", "gains, N·m·s/rad and N·m/rad; compensated inertia, kg·m²",
+           ("P", "I", "J_c", "inertia compensated")),
+    FigureMeaning("critical", "lowest set speed: a stuck bit comes free and turns on", ("critical speed",)),
+    FigureMeaning("by ramp", f"the same after a ramp from standstill, {START_DRAWS} of the draws"),
+    FigureMeaning("linear", "speed below which steady rotation is unstable, no noise"),
+    FigureMeaning("phase margin", "phase that the loop may lose, least of all draws", ("phase",)),
+    FigureMeaning("gain margin", "change of all gains that is unstable; 6 dB: factor of 2"),
+    FigureMeaning("dead time", "reserve: further dead time that makes the loop unstable"),
+    FigureMeaning("a, φ", "softness, frequency factor: P = ζ/a, I = (φω)² (J − J_c)"),
+    FigureMeaning("J compensated", "share of J that the speed loop compensates"),
+    FigureMeaning("|r|, mean", f"reflection |r| at the lowest mode; mean, {BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz"),
+    FigureMeaning("|r|", "share of a wave that the top sends back: 0 none, 1 all", ("|r| of the top drive",)),
+    FigureMeaning("damping ψ", "damping ratio of the least damped mode; 0: no decay",
+           ("least damping", "least damping of the lowest modes")),
+    FigureMeaning("no noise ψ", "critical speed without noise of the bit"),
+    FigureMeaning("J wrong", "damping, and critical speed (cure), if J is wrong so much"),
+    FigureMeaning("bit torque", "torque of a bit that turns fast", ("bit torque, weight on bit",)),
+    FigureMeaning("stable", "the bit turns, and comes free if it was stuck"),
+    FigureMeaning("at risk", "the bit goes on turning; once stuck, it stays stuck"),
+    FigureMeaning("stick-slip", "the bit sticks and slips, again and again"),
+    FigureMeaning("level", "highest of: smooth, at risk, stick-slip"),
+    FigureMeaning("record", "file, and time of rotation in it"),
+    FigureMeaning("before", "the first record"),
+    FigureMeaning("after", "the record of --against"),
+    FigureMeaning("severity index",
+           f"swing over mean speed at the bit; {AT_RISK_INDEX:g}: at risk, {STICK_SLIP_INDEX:g}: stick-slip"),
+    FigureMeaning("oscillation", "period and frequency of the torsional vibration"),
+    FigureMeaning("downhole speed", "speed of the bit by the waves at the top; ±: half its swing"),
+    FigureMeaning("string torque", "T − J α at the top of the string; ±: half its swing"),
+    FigureMeaning("verdict", "agreement of the run with tune"),
+    FigureMeaning("why", "reason of the verdict"),
+    FigureMeaning("measured", "value of this run"),
+    FigureMeaning("tune", "prediction of tdhil tune", ("by tune",)),
+    FigureMeaning("torque at the top", "torque of the drive, while the bit sticks and turns"),
+    FigureMeaning("trials", "set speeds from a stuck bit, and how the bit ended"),
+    FigureMeaning("last stick on the ramp", "set speed at which the bit stood still for the last time"),
+    FigureMeaning("unknown torque", "torque on the shaft that no command explains; its energy",
+           ("torque without a command", "energy by the loop's own errors")),
+    FigureMeaning("turned", "the real machine, and the factor from its torques"),
+    FigureMeaning("torque limit", "limit of the drive; if it acts, the result is invalid"),
+    FigureMeaning("reported speed beside the observer's", "difference of measured and computed speed"),
+    FigureMeaning("log", "file of the run"),
+)
+"""Every figure in the order in which a card shows it."""
+
+
+def meaning(name: str) -> FigureMeaning | None:
+    """Return the figure of a row or column; None: not explained. Unit, shaft and a percentage do not count."""
+    name = re.sub(r" [+−-]?[\d.]+ %", "", name).strip()
+    short = name.split(",")[0]
+    return next((one for label in (name, short) for one in FIGURES if label in (one.name, *one.also)), None)
+
+
+def words_of(name: str) -> str:
+    """Return the meaning as a sentence. Raises StopIteration for an unknown figure."""
+    words = next(one.words for one in FIGURES if one.name == name)
+    return f"{words[0].upper()}{words[1:]}."
+
+
+def explained(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the figures of the named rows and columns, each once, with their meanings in the order of `FIGURES`."""
+    found = [meaning(name) for name in names]
+    return [(one.name, one.words) for one in FIGURES if one in found]
+
+
+def print_meanings(names: Iterable[str], console: PlainConsole) -> None:
+    """Print one line for each named row and column."""
+    console.print(Words(f"{HEADING.lower()} ({MORE}, see tdhil docs)", style="bold"))
+    console.print(names_and_texts(explained(names), quiet=True))
+
+
+def meanings_section(names: Iterable[str]) -> ReportSection:
+    """Return the meanings of the named rows and columns as a section of the page."""
+    return ReportSection(HEADING, (Pairs(tuple(explained(names))), Text(f"More: {MORE} (see tdhil docs).")))
