@@ -35,7 +35,7 @@ from tdhil.soft_torque.torsional_severity import (
     turning_spans,
 )
 from tdhil.soft_torque.tuned_figures import in_squares, string_modes_hz
-from tdhil.soft_torque.uncertainty import COVERAGE_K, Interval
+from tdhil.soft_torque.uncertainty import COVERAGE_K, Interval, StringFactors
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -278,14 +278,9 @@ def _bit_ends(string: DrillString) -> list[tuple[DrillString, DrillString]]:
     tolerance, bit = string.tolerance, string.bit
     share, factor = tolerance.bottom_inertia, tolerance.drag_factor
 
-    def dragged(times: float) -> DrillString:
-        return replace(string, lines=tuple(replace(line, drag_nm_s_rad_m=times * line.drag_nm_s_rad_m)
-                                           for line in string.lines))
-
-    def loaded(times: float) -> DrillString:
-        return replace(string, bottom_inertia_kg_m2=times * string.bottom_inertia_kg_m2)
-
-    pairs = [(loaded(1.0 - share), loaded(1.0 + share)), (dragged(1.0 / factor), dragged(factor))]
+    factors = ((StringFactors(bottom=1.0 - share), StringFactors(bottom=1.0 + share)),
+               (StringFactors(drag=1.0 / factor), StringFactors(drag=factor)))
+    pairs = [(low.applied_to(string), high.applied_to(string)) for low, high in factors]
     if bit is not None and bit.stribeck_speed_rad_s < inf:
         pairs.append((replace(string, bit=replace(bit, stribeck_speed_rad_s=bit.stribeck_speed_rad_s
                                                   / tolerance.stribeck_factor)),

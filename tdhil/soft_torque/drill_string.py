@@ -31,7 +31,7 @@ All quantities are at the main shaft, from which the string hangs.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, pi, sqrt, tan
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -51,6 +51,10 @@ MUD_DRAG_NM_S_RAD_M = 0.005
 WALL_FRICTION_KINETIC, WALL_FRICTION_STATIC = 0.2, 0.3
 """Friction coefficients of steel on rock or casing in mud: the order of magnitude in torque-and-drag programs; not
 measured on this well."""
+WALL_FRICTION_FACTOR = 1.5
+"""Tolerance of the friction coefficients as a factor, up or down. From standstill it gives 0.20 to 0.45.
+C. A. Johancsik, D. B. Friesen and R. Dawson (1984), SPE-11380-PA, fitted 0.25 to 0.40 in water-base mud to torque and
+hook load."""
 SHEAR_RANGE_PA = (61e9, 80e9)
 """Range of the shear modulus G of a steel string, Pa: 79 to 80 GPa by the handbook; U. J. Aarsnes and R. Shor (2018)
 fitted 61 GPa for pipe and 67 GPa for collars to field data, tool joints and connections included."""
@@ -60,10 +64,16 @@ LENGTH_TOLERANCE = 0.01
 """Relative tolerance of the length: one stand of 28 m on a string of 3,000 m."""
 WORN_POLAR_SHARE = 0.85
 """Polar moment of area of pipe with 80 % of its wall left (API RP 7G, premium class), divided by that of new pipe."""
+PIPE_OUTER_TOLERANCE = 0.0075
+"""Relative tolerance of the outside diameter of new pipe of 4 inches and more. API Spec 5D (1991), 6.7: −0.75 %."""
+PIPE_INNER_TOLERANCE = 0.0075
+"""Relative tolerance of the inside diameter of new pipe. API Spec 5D limits it by the outside diameter and the weight
+only; with this value, which is an assumption, the wall of 5 inch pipe keeps to −10 % (API: −12.5 %)."""
 DRAG_FACTOR = 2.5
 """Tolerance of the mud's drag as a factor, up or down. The drag is a guess in every string file."""
 BOTTOM_TOLERANCE = 0.10
-"""Relative tolerance of the inertia at the bottom."""
+"""Relative tolerance of the inertia at the bottom, and of the polar moment of area of the bottom-hole assembly if it is
+stated as sections. It is an assumption: 2.5 % of the diameter of a collar."""
 BIT_TORQUE_TOLERANCE, STRIBECK_FACTOR, NOISE_FACTOR = 0.15, 1.25, 1.5
 """Tolerances of a stated bit: torque (relative), Stribeck speed and noise (factors, up or down). They are assumptions,
 like the bit itself: a search of the literature found no measured scatter."""
@@ -181,12 +191,16 @@ class ToleranceFile(DataModel):
     shear_modulus: _Share | None = Field(
         default=None, description="of shear_modulus_pa; default 61 to 80 GPa, or 5 % of a value that is stated")
     wear: _Share = Field(default=1.0 - WORN_POLAR_SHARE, description="loss of polar moment of area, at most")
-    outer_diameter: _Share | None = Field(default=None, description="of the pipe, for calibrate torque --known-pipe")
-    inner_diameter: _Share | None = Field(default=None, description="of the pipe, for calibrate torque --known-pipe")
+    outer_diameter: _Share | None = Field(
+        default=None, description="of the pipe; default 0.75 %. If it or inner_diameter is stated, wear counts only if"
+        " it is stated too")
+    inner_diameter: _Share | None = Field(default=None, description="of the pipe; default 0.75 %")
     density: _Share | None = Field(
         default=None, description="of density_kg_m3, for calibrate torque --known-pipe; default 0.5 %")
     drag: Annotated[float, Field(ge=0.0, le=9.0)] = Field(
         default=DRAG_FACTOR - 1.0, description="1.5 is a factor of 2.5, up or down")
+    wall_friction: Annotated[float, Field(ge=0.0, le=9.0)] = Field(
+        default=WALL_FRICTION_FACTOR - 1.0, description="of both friction coefficients; 0.5 is a factor of 1.5")
     bottom_inertia: _Share = BOTTOM_TOLERANCE
     bit_torque: _Share = BIT_TORQUE_TOLERANCE
     stribeck_speed: _Share = STRIBECK_FACTOR - 1.0
@@ -226,6 +240,10 @@ class WaveLine:
     """Kinetic dry friction on the wall of the hole, N·m per metre."""
     static_nm_m: float = 0.0
     """Static dry friction on the wall of the hole, N·m per metre."""
+    outer_share: float = 1.0
+    """OD⁴/(OD⁴ − ID⁴): the polar moment of area grows by 4 times this share if OD grows alone. 1: a solid bar."""
+    in_bottom: bool = False
+    """True: a section of the bottom-hole assembly."""
 
     @property
     def has_friction(self) -> bool:
@@ -256,19 +274,22 @@ class StringTolerance:
     shear: tuple[float, float] = (1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE)
     """Smallest and largest G, as factors on the stated one."""
     polar: tuple[float, float] = (WORN_POLAR_SHARE, 1.0)
-    """Smallest and largest polar moment of area, as factors on that of the stated diameters."""
+    """Smallest and largest polar moment of area of worn pipe, as factors on that of new pipe."""
     drag_factor: float = DRAG_FACTOR
     bottom_inertia: float = BOTTOM_TOLERANCE
     bit_torque: float = BIT_TORQUE_TOLERANCE
     stribeck_factor: float = STRIBECK_FACTOR
     noise_factor: float = NOISE_FACTOR
+    outer_diameter: float = PIPE_OUTER_TOLERANCE
+    inner_diameter: float = PIPE_INNER_TOLERANCE
+    wall_friction_factor: float = WALL_FRICTION_FACTOR
 
 
 STRING_AS_USUAL = StringTolerance()
 """Default tolerances of a stated string."""
-IDENTIFIED_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 2.0, 0.0)
+IDENTIFIED_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 2.0, 0.0, outer_diameter=0.0, inner_diameter=0.0)
 """Tolerances of an identified string: k, f and J_L are drawn from their own intervals, the losses from a factor."""
-EXACT_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 1.0, 0.0, 0.0, 1.0, 1.0)
+EXACT_STRING = StringTolerance(0.0, (1.0, 1.0), (1.0, 1.0), 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0)
 """Tolerances of a string that is known exactly, such as a simulated one."""
 
 
@@ -379,7 +400,8 @@ def line_of(section: PipeSection) -> WaveLine:
     radius = 0.5 * max(section.outer_diameter_m, 0.0 if joints is None else joints.outer_diameter_m)
     kinetic = section.friction_kinetic * section.side_force_n_m * radius
     static = max(kinetic, section.friction_static * section.side_force_n_m * radius)
-    return WaveLine(length, inertia, compliance, section.drag_nm_s_rad_m, kinetic, static)
+    outer4, inner4 = section.outer_diameter_m**4, section.inner_diameter_m**4
+    return WaveLine(length, inertia, compliance, section.drag_nm_s_rad_m, kinetic, static, outer4 / (outer4 - inner4))
 
 
 def _per_metre(section: PipeSection, outer_m: float, inner_m: float) -> tuple[float, float]:
@@ -398,7 +420,8 @@ def string_of(file: StringFile) -> DrillString:
         bit = BitFriction(bottom.coulomb_nm, static, speed, noise, bottom.noise_correlation_s,
                           bottom.torque_per_weight_nm_kn)
     sections = (*file.sections, *bottom.sections)
-    lines = tuple(line_of(section) for section in sections)
+    lines = (*(line_of(section) for section in file.sections),
+             *(replace(line_of(section), in_bottom=True) for section in bottom.sections))
     stated = file.tolerance or ToleranceFile()
     # without a stated G, the range is that of all values fitted to field data
     low, high = (one / STEEL_SHEAR_MODULUS_PA for one in SHEAR_RANGE_PA)
@@ -406,9 +429,14 @@ def string_of(file: StringFile) -> DrillString:
         low, high = 1.0 - stated.shear_modulus, 1.0 + stated.shear_modulus
     elif any(section.shear_modulus_pa != STEEL_SHEAR_MODULUS_PA for section in sections):
         low, high = 1.0 - STATED_SHEAR_TOLERANCE, 1.0 + STATED_SHEAR_TOLERANCE
+    outer, inner = stated.outer_diameter, stated.inner_diameter
+    # diameters with a stated tolerance are measured ones, and contain the wear
+    worn = (outer is None and inner is None) or "wear" in stated.model_fields_set
     tolerance = StringTolerance(
-        stated.length, (low, high), (1.0 - stated.wear, 1.0), 1.0 + stated.drag,
-        stated.bottom_inertia, stated.bit_torque, 1.0 + stated.stribeck_speed, 1.0 + stated.noise)
+        stated.length, (low, high), (1.0 - stated.wear if worn else 1.0, 1.0), 1.0 + stated.drag,
+        stated.bottom_inertia, stated.bit_torque, 1.0 + stated.stribeck_speed, 1.0 + stated.noise,
+        PIPE_OUTER_TOLERANCE if outer is None else outer, PIPE_INNER_TOLERANCE if inner is None else inner,
+        1.0 + stated.wall_friction)
     return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name, tolerance=tolerance)
 
 

@@ -23,7 +23,7 @@ b divided by the spectrum of b, in the band of the oscillation. A soft-torque co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf, pi, sqrt
 
@@ -34,7 +34,7 @@ from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive, reflection_at
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.tuned_figures import in_squares, string_modes_hz
-from tdhil.soft_torque.uncertainty import Interval, student_factor
+from tdhil.soft_torque.uncertainty import Interval, StringFactors, student_factor
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -391,14 +391,14 @@ def string_ends(string: DrillString) -> list[tuple[DrillString, DrillString]]:
     """Return the string at both ends of each tolerance on which the downhole speed depends."""
     tolerance = string.tolerance
 
-    def lines(length: float = 1.0, shear: float = 1.0, polar: float = 1.0) -> DrillString:
-        return replace(string, lines=tuple(
-            replace(line, length_m=length * line.length_m, inertia_kg_m=polar * line.inertia_kg_m,
-                    compliance_rad_nm_m=line.compliance_rad_nm_m / (shear * polar)) for line in string.lines))
-
-    pairs = [(lines(length=1.0 - tolerance.length), lines(length=1.0 + tolerance.length)),
-             (lines(shear=tolerance.shear[0]), lines(shear=tolerance.shear[1])),
-             (lines(polar=tolerance.polar[0]), lines(polar=tolerance.polar[1]))]
+    factors = (
+        [StringFactors(length=1.0 + sign * tolerance.length) for sign in (-1.0, 1.0)],
+        [StringFactors(shear=one) for one in tolerance.shear],
+        [StringFactors(wear=one) for one in tolerance.polar],
+        [StringFactors(outer=1.0 + sign * tolerance.outer_diameter) for sign in (-1.0, 1.0)],
+        [StringFactors(inner=1.0 + sign * tolerance.inner_diameter) for sign in (-1.0, 1.0)],
+    )
+    pairs = [(low.applied_to(string), high.applied_to(string)) for low, high in factors]
     return [pair for pair in pairs if pair[0] != pair[1]]
 
 

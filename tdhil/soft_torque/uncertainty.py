@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, TopDrive
-from tdhil.soft_torque.drill_string import BitFriction, DrillString
+from tdhil.soft_torque.drill_string import DrillString
 
 COVERAGE_K = 1.959964
 """Half-width of a normal 95 % interval in standard deviations (coverage factor)."""
-COLUMNS_OF_STRING = 8
+COLUMNS_OF_STRING = 11
 """Number of drawn properties of string and bit. Their columns follow that of J and precede those of lags and gains."""
 
 
@@ -172,6 +172,34 @@ def independent_axes(
     return tuple((end(-axis), end(axis)) for axis in root.T)
 
 
+@dataclass(frozen=True)
+class StringFactors:
+    """Factors on the stated properties of a string. Pipe has diameters and wear; a bottom-hole assembly has neither."""
+
+    length: float = 1.0
+    shear: float = 1.0
+    wear: float = 1.0
+    outer: float = 1.0
+    inner: float = 1.0
+    drag: float = 1.0
+    wall: float = 1.0
+    bottom: float = 1.0
+    """Inertia at the bottom, and polar moment of area of the sections of the bottom-hole assembly."""
+
+    def applied_to(self, string: DrillString) -> DrillString:
+        """Return the string with these factors. The travel times of all lines change by one common factor."""
+        lines = []
+        for line in string.lines:
+            hollow = line.outer_share * self.outer**4 - (line.outer_share - 1.0) * self.inner**4
+            polar = self.bottom if line.in_bottom else self.wear * hollow
+            lines.append(replace(
+                line, length_m=self.length * line.length_m, inertia_kg_m=polar * line.inertia_kg_m,
+                compliance_rad_nm_m=line.compliance_rad_nm_m / (self.shear * polar),
+                drag_nm_s_rad_m=self.drag * line.drag_nm_s_rad_m, coulomb_nm_m=self.wall * line.coulomb_nm_m,
+                static_nm_m=self.wall * line.static_nm_m))
+        return replace(string, lines=tuple(lines), bottom_inertia_kg_m2=self.bottom * string.bottom_inertia_kg_m2)
+
+
 def string_at(string: DrillString, shares: NDArray[np.float64]) -> DrillString:
     """Return the string at the given positions (0 to 1) in the ranges of its `COLUMNS_OF_STRING` tolerances."""
     tolerance = string.tolerance
@@ -179,27 +207,25 @@ def string_at(string: DrillString, shares: NDArray[np.float64]) -> DrillString:
     def within(low: float, high: float, share: float) -> float:
         return low + (high - low) * float(share)
 
+    def about(half_width: float, share: float) -> float:
+        return within(1.0 - half_width, 1.0 + half_width, share)
+
     def times(factor: float, share: float) -> float:
         return exp(log(factor) * (2.0 * float(share) - 1.0))
 
-    length = within(1.0 - tolerance.length, 1.0 + tolerance.length, shares[0])
-    shear = within(*tolerance.shear, shares[1])
-    polar = within(*tolerance.polar, shares[2])
-    drag = times(tolerance.drag_factor, shares[3])
-    load = within(1.0 - tolerance.bottom_inertia, 1.0 + tolerance.bottom_inertia, shares[4])
-    lines = tuple(
-        replace(line, length_m=length * line.length_m, inertia_kg_m=polar * line.inertia_kg_m,
-                compliance_rad_nm_m=line.compliance_rad_nm_m / (shear * polar),
-                drag_nm_s_rad_m=drag * line.drag_nm_s_rad_m)
-        for line in string.lines
-    )
-    bit: BitFriction | None = string.bit
-    if bit is not None:
-        size = within(1.0 - tolerance.bit_torque, 1.0 + tolerance.bit_torque, shares[5])
-        bit = replace(bit, coulomb_nm=size * bit.coulomb_nm, static_nm=size * bit.static_nm,
-                      stribeck_speed_rad_s=times(tolerance.stribeck_factor, shares[6]) * bit.stribeck_speed_rad_s,
-                      noise_nm=times(tolerance.noise_factor, shares[7]) * bit.noise_nm)
-    return replace(string, lines=lines, bottom_inertia_kg_m2=load * string.bottom_inertia_kg_m2, bit=bit)
+    moved = StringFactors(
+        about(tolerance.length, shares[0]), within(*tolerance.shear, shares[1]), within(*tolerance.polar, shares[2]),
+        about(tolerance.outer_diameter, shares[3]), about(tolerance.inner_diameter, shares[4]),
+        times(tolerance.drag_factor, shares[5]), times(tolerance.wall_friction_factor, shares[6]),
+        about(tolerance.bottom_inertia, shares[7])).applied_to(string)
+    bit = string.bit
+    if bit is None:
+        return moved
+    size = about(tolerance.bit_torque, shares[8])
+    return replace(moved, bit=replace(
+        bit, coulomb_nm=size * bit.coulomb_nm, static_nm=size * bit.static_nm,
+        stribeck_speed_rad_s=times(tolerance.stribeck_factor, shares[9]) * bit.stribeck_speed_rad_s,
+        noise_nm=times(tolerance.noise_factor, shares[10]) * bit.noise_nm))
 
 
 def _latin_hypercube(count: int, columns: int, seed: int) -> NDArray[np.float64]:

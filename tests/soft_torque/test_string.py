@@ -10,8 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from profiles import DataFileError
-from tdhil.soft_torque import ClosedSystem, DrillString, WaveLine, load_string, spring_and_mass, string_modes_hz
-from tests.soft_torque.cases import STRING, Pipe, chain_modes, lumped_chain, string_with
+from tdhil.soft_torque import (
+    BottomEnd,
+    ClosedSystem,
+    DrillString,
+    Interval,
+    PipeSection,
+    StringFile,
+    ToleranceFile,
+    TopDrive,
+    WaveLine,
+    draw_truths,
+    load_string,
+    spring_and_mass,
+    string_modes_hz,
+    string_of,
+)
+from tests.soft_torque.cases import FIVE_INCH, STRING, Pipe, chain_modes, lumped_chain, string_with
 
 GOOD = """\
 sections:
@@ -167,3 +182,48 @@ def test_a_spring_and_a_mass_as_identified_swing_as_they_were_seen_to():
     assert mode.damping == pytest.approx(40.0 * 2 * pi * 0.1299 / (2 * 314.0), rel=0.03)     # c ω/2k
     (mode,) = ClosedSystem(string).modes(0.2)
     assert mode.damping == pytest.approx(0.010, abs=0.001)
+
+
+def drawn(**tolerance):
+    """Return 200 strings of pipe on a deviated wall above collars, drawn with these tolerances and no others."""
+    none = {"length": 0.0, "shear_modulus": 0.0, "wear": 0.0, "outer_diameter": 0.0, "inner_diameter": 0.0,
+            "drag": 0.0, "wall_friction": 0.0, "bottom_inertia": 0.0}
+    pipe = PipeSection(length_m=2800.0, side_force_n_m=100.0, **FIVE_INCH)
+    collars = PipeSection(length_m=200.0, outer_diameter_m=0.2032, inner_diameter_m=0.0714)
+    string = string_of(StringFile(sections=(pipe,), bottom=BottomEnd(sections=(collars,)),
+                                  tolerance=ToleranceFile(**{**none, **tolerance})))
+    found = draw_truths(string, TopDrive(1500.0, 8.0, 60.0, (0.01,)), Interval(1500.0, 1500.0, 1500.0), count=200)
+    lines = [[getattr(one.string.lines[k], name) / getattr(string.lines[k], name)
+              for k, name in ((0, "inertia_kg_m"), (1, "inertia_kg_m"), (0, "static_nm_m"))] for one in found]
+    return np.array(lines).T
+
+
+def ratio(outer, inner):
+    """Polar moment of area of 5 inch pipe with changed diameters, divided by that of the stated ones."""
+    return ((0.127 * outer)**4 - (0.1086 * inner)**4) / (0.127**4 - 0.1086**4)
+
+
+@pytest.mark.parametrize(("tolerance", "moved", "low", "high"), [
+    ({"outer_diameter": 0.0075}, 0, ratio(0.9925, 1.0), ratio(1.0075, 1.0)),
+    ({"inner_diameter": 0.0075}, 0, ratio(1.0, 1.0075), ratio(1.0, 0.9925)),
+    ({"wear": 0.15}, 0, 0.85, 1.0),
+    ({"bottom_inertia": 0.1}, 1, 0.9, 1.1),
+    ({"wall_friction": 0.5}, 2, 1.0 / 1.5, 1.5),
+])
+def test_diameters_collars_and_wall_friction_are_drawn_over_their_tolerances(tolerance, moved, low, high):
+    """Each tolerance moves its own property over its whole range, and no other one."""
+    found = drawn(**tolerance)
+    assert low <= found[moved].min() < low + 0.02 * (high - low) and high - 0.02 * (high - low) < found[moved].max()
+    assert found[moved].max() <= high
+    assert np.delete(found, moved, axis=0) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_measured_diameters_contain_the_wear():
+    def polar(**tolerance):
+        section = PipeSection(length_m=1000.0, **FIVE_INCH)
+        return string_of(StringFile(sections=(section,), bottom=BottomEnd(inertia_kg_m2=100.0),
+                                    tolerance=ToleranceFile(**tolerance))).tolerance.polar
+
+    assert polar() == pytest.approx((0.85, 1.0))
+    assert polar(outer_diameter=0.001) == (1.0, 1.0)
+    assert polar(outer_diameter=0.001, wear=0.05) == pytest.approx((0.95, 1.0))
