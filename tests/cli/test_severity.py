@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from tdhil.cli.main import main
+from tdhil.soft_torque import reflection_at
 from tests.cli.test_tune import result
+from tests.soft_torque.cases import DRIVE, SOFT_035, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
 MOTOR = ("--gear", "10")
@@ -73,6 +75,30 @@ def test_mistakes(bench, capsys, change, code, message):
     assert seen == code
     assert message in err or "no soft controller" in err
     assert "Traceback" not in err
+
+
+def controller_file(bench, refused=""):
+    """Write what `tune --json` writes of one soft controller, a = 0.35 of the reference case."""
+    main = {"inertia_kg_m2": {"value": 1500.0, "low": 1440.0, "high": 1560.0}, "viscous_nm_s_rad": 8.0,
+            "coulomb_nm": 60.0, "inner_lags_s": [0.02, 0.01, 0.003]}
+    gains = {"gain_nm_s_rad": 847.1, "integral_nm_rad": 705.1, "compensated_kg_m2": 0.0, "derivative_filter_s": 0.05}
+    path = bench / "tune.json"
+    path.write_text(json.dumps({
+        "main_shaft": main, "string": {}, "identified": {}, "tuned_for": {},
+        "controllers": [{"kind": "soft", "refused": refused or None, "at_main_shaft": gains}]}), encoding="utf-8")
+    return "--controller", str(path)
+
+
+def test_the_reflection_of_the_record_is_compared_with_that_of_the_gains(bench, capsys):
+    """The top of the record hardly moves: it sends nearly all of a wave back, unlike a top with soft gains."""
+    code, out, err = ran(bench, capsys, *controller_file(bench), "--json")
+    assert code == 0, err
+    (found,) = json.loads(out)["records"]
+    hertz = np.array([0.5 * (found["reflection"]["from_hz"] + found["reflection"]["to_hz"])])
+    assert found["reflection"]["expected"] == pytest.approx(reflection_at(DRIVE, SOFT_035, STRING, hertz)[0], abs=0.02)
+    assert found["reflection"]["verdict"] == "reflects more"
+    code, _, err = ran(bench, capsys, *controller_file(bench, refused="too little margin"))
+    assert code == 2 and "no soft controller" in err
 
 
 def test_a_record_at_standstill_is_refused(bench, capsys):

@@ -407,6 +407,16 @@ def test_the_gains_that_the_drive_reported_are_compared():
     assert present_of() == (None, None)
 
 
+@pytest.mark.parametrize(("loop", "dead_time_s"), [("drive", 0.02), ("bus", 0.2)])
+def test_the_default_dead_time_is_ten_control_periods(loop, dead_time_s):
+    """The control period is 2 ms in the drive, and over the bus the cycle of the run, 20 ms."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    case, _ = case_of(result(), parser.parse_args(["result.json", "--string", str(STRING_YAML), "--loop", loop]))
+    assert (case.required.phase_deg, case.required.gain_db) == (30.0, 6.0)
+    assert case.required.dead_time_s == pytest.approx(dead_time_s)
+
+
 def drawn_of(**said):
     """Return J of each draw, and the (k, J_L) of its string, both at the main shaft."""
     parser = argparse.ArgumentParser()

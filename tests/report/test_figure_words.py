@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from tdhil.report import (
     PlainConsole,
@@ -21,6 +22,7 @@ from tdhil.report import (
 )
 from tdhil.report.blocks import Pairs, Table
 from tdhil.report.figure_words import FIGURES, HEADING, meaning
+from tdhil.report.operator_map import print_map
 from tdhil.report.tuning import TunedFor, print_tuning, tuning_report
 from tdhil.soft_torque import (
     DepthRow,
@@ -124,6 +126,23 @@ def test_figures_of_a_tuning(tuned):
     assert "bit noise" in text and "200 N·m rms" in text and "reserve" in text
 
 
+@pytest.mark.heavy
+def test_a_thin_margin_is_red_with_its_number_and_its_limit(tuned):
+    """The present gains keep too little phase: their cell is red, and a red line has the limit."""
+    red = "\x1b[1;31m"
+    printed = io.StringIO()
+    print_tuning(tuned, Console(file=printed, force_terminal=True, color_system="standard", width=80))
+    present = tuned["controllers"][0]["margins"]
+    degrees = f"{present['worst']['phase_deg']:.0f}°"
+    (row,) = [line for line in printed.getvalue().splitlines() if line.startswith("phase margin ") and degrees in line]
+    assert row.split(red)[1].split("\x1b")[0].strip() == degrees and row.count(red) == 1
+    line = next(line for line in printed.getvalue().splitlines() if "present: thin margins" in line)
+    assert line.startswith(red) and f"phase margin {degrees} (limit 30°)" in line
+    page = tuning_report(tuned, None)
+    (cells,) = [row for row in page.sections[0].blocks[0].rows if row[0] == "phase margin"]
+    assert [cell.startswith("⚠") for cell in cells[1:]].count(True) == 1 and cells[1] == f"⚠ {degrees}"
+
+
 def test_figures_of_an_evaluation():
     log = rows(57.0, (60.0, 56.3, 57.2), damping=0.22)
     found = evaluation(log)
@@ -144,3 +163,14 @@ def test_figures_of_a_severity(names):
     page = severity_report(document, [found] * len(names))
     in_figures = [block.rows for block in page.sections[0].blocks]
     check(page, shown_by(print_severity, document), [row[0] for row in in_figures[0]])
+
+
+def test_the_map_in_words_is_that_of_its_cells():
+    """A row states the speed from which all cells are stable, and the highest speed with stick-slip."""
+    speeds_rpm = (20.0, 40.0, 60.0, 80.0)
+    stiff = (("stick-slip", "stable", "at risk", "stable"), ("stick-slip", "stick-slip", "at risk", "at risk"))
+    found = map_document(OperatorMap(speeds_rpm, (2500.0, 3000.0), {"stiff": stiff}))
+    lines = [" ".join(line.split()) for line in shown_by(print_map, found).splitlines()]
+    assert [line for line in lines if "kN·m" in line] == [
+        "2.5 kN·m stable from 80 rpm, stick-slip up to 20", "3 kN·m not stable up to 80 rpm, stick-slip up to 40"]
+    assert "Yellow: The bit goes on turning" in found["how_to_read"]

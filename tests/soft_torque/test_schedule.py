@@ -6,8 +6,13 @@ from dataclasses import replace
 
 import pytest
 
+from tdhil.report import schedule_document
 from tdhil.soft_torque import (
+    DepthRow,
+    DepthSchedule,
+    DrawnValues,
     Interval,
+    LoopMargins,
     RequiredMargins,
     SpeedController,
     TuneCase,
@@ -68,6 +73,33 @@ def test_critical_speeds_stand_beside_those_of_the_present_gains():
     case = replace(CASE, present=SpeedController(4000.0, 3000.0), draws=6)
     (row,) = schedule(case, (1500.0,), "soft").rows
     assert row.cure.median < row.compared.median
+
+
+def sentence_of(between, speeds):
+    """Return the sentence of the report on rows at 1, 2 and 3 km, with (depth, phase, speed, failed) between them."""
+    def row(depth_m, speed_rpm, phase_deg=60.0, failed=()):
+        return DepthRow(depth_m, 0.13, SpeedController(800.0, 700.0), worst=replace(MARGINS, phase_deg=phase_deg),
+                        failed=failed, cure=DrawnValues((speed_rpm,)))
+
+    rows = tuple(row(1000.0 * (k + 1), speed) for k, speed in enumerate(speeds))
+    halfway = tuple(row(depth, speed, phase, failed) for depth, phase, speed, failed in between)
+    found = DepthSchedule("soft", "stiff", rows, halfway)
+    return schedule_document(found, 1.0, lambda law: ())["sentence"]
+
+
+MARGINS = LoopMargins(True, 60.0, 12.0, 0.1, 0.1, 0.5)
+
+
+def test_the_sentence_states_the_worst_case_between_the_depths():
+    """The worst case is the least phase, and the largest rise above the higher one of both neighbours."""
+    calm = sentence_of(((1500.0, 41.0, 52.0, ()), (2500.0, 55.0, 41.0, ())), (50.0, 52.0, 40.0))
+    assert calm == ("Interpolated halfway between rows: least phase margin 41° (at 1500 m); critical speed nowhere "
+                    "above that of the neighbouring rows.")
+    worse = sentence_of(((1500.0, 55.0, 52.0, ()), (2500.0, 28.0, 65.0, ("phase margin 28° (limit 30°)",))),
+                        (50.0, 52.0, 40.0))
+    assert worse == ("Interpolated halfway between rows: least phase margin 28° (at 2500 m), thin at 2500 m; critical "
+                     "speed at most 25 % above that of the neighbouring rows (at 2500 m).")
+    assert sentence_of((), (50.0,)).startswith("No two neighbouring depths have gains")
 
 
 @pytest.mark.heavy
