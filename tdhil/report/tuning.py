@@ -41,6 +41,7 @@ from tdhil.soft_torque import (
     SpeedController,
     Tuned,
     Tuning,
+    has_light_bit,
     in_squares,
     reflection_at,
     simulate,
@@ -56,8 +57,8 @@ SIMULATION_ERROR_RPM, SIMULATION_ERROR_SHARE = 0.5, 0.015
 """Error of a simulated critical speed, rpm and share: half of the search's step, and the effects of the time step
 and of the simulation's length (stiff loop of the reference case: 182 instead of 183)."""
 LIGHT_BIT_ERROR_SHARE = 0.04
-"""The share for a bottom end of sections, whose bit has no inertia. The tick of the search gives 75 rpm for 200 m of
-8 inch collars, a chain of masses 78 rpm."""
+"""The share for a light bit (`has_light_bit`), such as one below collars that are stated as sections. The tick of the
+search gives 75 rpm for 200 m of 8 inch collars, a chain of masses 78 rpm."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _MEANT = {
     "cure": "lowest set speed at which a stuck bit comes free and turns on, the top at full speed",
@@ -96,7 +97,8 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     taken = [one for one in tuning.tuned if one.controller is not None]
     search = tuning.searched
     lag_s = case.drive.total_lag_s
-    share = SIMULATION_ERROR_SHARE if string.bottom_inertia_kg_m2 > 0.0 else LIGHT_BIT_ERROR_SHARE
+    light = search is not None and has_light_bit(string, search.longest_tick_s)
+    share = LIGHT_BIT_ERROR_SHARE if light else SIMULATION_ERROR_SHARE
     # For |r| > 1 the loop is stable only by the losses of the string, which are not measured.
     warnings, wide_hz = [*tuned_for.warnings], np.geomspace(0.02, 5.0, 300)
     for one in tuning.tuned:

@@ -104,7 +104,7 @@ def _own_delay_s(string: DrillString) -> float:
     return string.bottom_inertia_kg_m2 / string.lines[-1].impedance_nm_s_rad
 
 
-def _has_light_bit(string: DrillString, longest_tick_s: float) -> bool:
+def has_light_bit(string: DrillString, longest_tick_s: float) -> bool:
     """Return whether the bottom has less inertia than half a tick of its line."""
     return _own_delay_s(string) < 0.5 * longest_tick_s
 
@@ -117,7 +117,7 @@ def _steepest_fall(falls: Array, width: Array) -> Array:
 def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid:
     """Return the grid with the tick for which rounding changes the travel times of all lines least."""
     delays = np.array([line.delay_s for line in string.lines])
-    light = _has_light_bit(string, longest_tick_s)
+    light = has_light_bit(string, longest_tick_s)
     if light:
         delays[-1] += _own_delay_s(string)
 
@@ -782,18 +782,19 @@ NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPE
 """Relative resolution of a critical speed under noise: 3 %."""
 
 
-def coarse_tick_s(string: DrillString) -> float:
-    """Return the longest tick, s, for the search for critical speeds of that string.
-
-    A light bit whose friction falls more steeply than its line damps jumps from speed to speed. It needs a finer tick.
-    """
-    tick_s = min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
+def bit_jumps(string: DrillString, longest_tick_s: float) -> bool:
+    """Return whether a light bit's friction falls more steeply than its line damps: it jumps from speed to speed."""
     damps, bit = string.lines[-1].impedance_nm_s_rad + string.bottom_viscous_nm_s_rad, string.bit
-    if bit is not None and _has_light_bit(string, tick_s):
-        falls = np.array(bit.static_nm - bit.coulomb_nm)
-        if _steepest_fall(falls, np.array(bit.stribeck_speed_rad_s)) > damps:
-            return min(tick_s, LONGEST_TICK_S)
-    return tick_s
+    if bit is None or not has_light_bit(string, longest_tick_s):
+        return False
+    falls = np.array(bit.static_nm - bit.coulomb_nm)
+    return bool(_steepest_fall(falls, np.array(bit.stribeck_speed_rad_s)) > damps)
+
+
+def coarse_tick_s(string: DrillString) -> float:
+    """Return the longest tick, s, for the search for critical speeds of that string; finer for a bit that jumps."""
+    tick_s = min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
+    return min(tick_s, LONGEST_TICK_S) if bit_jumps(string, tick_s) else tick_s
 
 
 def lowest_turning_with_noise(

@@ -6,17 +6,26 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from tdhil.report import TunedFor, tuning_document
+from tdhil.report.tuning import LIGHT_BIT_ERROR_SHARE, SIMULATION_ERROR_SHARE
 from tdhil.soft_torque import (
     RPM,
+    Advice,
     Begin,
     BitFriction,
     ClosedSystem,
     DrillString,
+    Interval,
+    Margins,
     Search,
     SpeedController,
     TopDrive,
+    TuneCase,
+    Tuned,
+    Tuning,
     critical_speeds,
     grid_of,
+    has_light_bit,
     lowest_turning,
     lowest_turning_with_noise,
     reflection_at,
@@ -39,6 +48,7 @@ from tests.soft_torque.cases import (
 from tests.soft_torque.chain_in_time import ends_turning as ends_turning_of_chain
 from tests.soft_torque.chain_in_time import lowest_turning_of_chain, reference_case
 
+J = Interval(1500.0, 1500.0, 1500.0)
 SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None, "coulomb_nm": 0.0}
 """Bit without dry friction, so that the whole system is linear."""
 
@@ -195,6 +205,21 @@ def test_the_critical_speed_above_collars_is_that_of_the_chain_with_the_tick_of_
     speeds = np.arange(68.0, 93.0, 1.0)
     turns = ends_turning_of_chain(**chain, rpm=speeds[None], calm=12.0 * search.calm_s / search.duration_s)[0]
     assert found == pytest.approx(speeds[~turns].max() + 1.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("inertia_kg_m2", "light"), [(0.0, True), (2.0, True), (40.0, False)])
+def test_grid_and_report_have_one_rule_for_a_light_bit(inertia_kg_m2, light):
+    """Below 8 inch collars (ζ 4,112 N·m·s/rad), half a tick of 6 ms is 12.3 kg·m²."""
+    string = above_collars(2800.0, 200.0, 0.2032, inertia_kg_m2=inertia_kg_m2)
+    assert has_light_bit(string, 0.006) is light
+    assert (grid_of(string, 0.006).bottom_inertia_kg_m2 == 0.0) is light
+    stiff = Tuned("stiff", STIFF, reflection=J, band_reflection=J, damping=J, margins=Margins(60.0, 10.0, 0.5),
+                  quiet_cures=(75.0,) * 5)
+    case = TuneCase(string, DRIVE, J)
+    tuning = Tuning(case, (0.13,), (stiff,), Search(), Advice(None, "stiff", keep=False))
+    (one,) = tuning_document(tuning, TunedFor("x", True, None, 1.0, "drive", "stated"))["controllers"]
+    share = LIGHT_BIT_ERROR_SHARE if light else SIMULATION_ERROR_SHARE
+    assert one["critical_rpm"]["cure"]["high"] == pytest.approx(75.0 + 0.5 + share * 75.0)
 
 
 @pytest.mark.parametrize(("outer_m", "jumps"), [(0.2032, False), (0.127, True)])
