@@ -41,6 +41,7 @@ from tdhil.soft_torque import (
     SpeedController,
     Tuned,
     Tuning,
+    bit_jumps,
     has_light_bit,
     in_squares,
     reflection_at,
@@ -59,6 +60,9 @@ and of the simulation's length (stiff loop of the reference case: 182 instead of
 LIGHT_BIT_ERROR_SHARE = 0.04
 """The share for a light bit (`has_light_bit`), such as one below collars that are stated as sections. The tick of the
 search gives 75 rpm for 200 m of 8 inch collars, a chain of masses 78 rpm."""
+JUMPING_BIT_ERROR_SHARE = 0.18
+"""The share for a light bit that jumps from speed to speed (`bit_jumps`). For 200 m of 5 inch collars the search gives
+107.5 rpm with ticks of 1.5 to 6 ms; a chain with 9 masses in the collars 122 rpm, with 18 masses 127 rpm."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _MEANT = {
     "cure": "lowest set speed at which a stuck bit comes free and turns on, the top at full speed",
@@ -97,10 +101,17 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     taken = [one for one in tuning.tuned if one.controller is not None]
     search = tuning.searched
     lag_s = case.drive.total_lag_s
-    light = search is not None and has_light_bit(string, search.longest_tick_s)
-    share = LIGHT_BIT_ERROR_SHARE if light else SIMULATION_ERROR_SHARE
+    share = SIMULATION_ERROR_SHARE
+    if search is not None and has_light_bit(string, search.longest_tick_s):
+        share = LIGHT_BIT_ERROR_SHARE
+    jumps = search is not None and bit_jumps(string, search.longest_tick_s)
     # For |r| > 1 the loop is stable only by the losses of the string, which are not measured.
     warnings, wide_hz = [*tuned_for.warnings], np.geomspace(0.02, 5.0, 300)
+    if jumps:
+        share = JUMPING_BIT_ERROR_SHARE
+        warnings.append("The friction of the bit falls more steeply with speed than the lowest section damps, so it"
+                        f" jumps from speed to speed. The critical speeds may be {100.0 * share:.0f} % too low. Take"
+                        " them as lower limits.")
     for one in tuning.tuned:
         if one.controller is not None:
             over = reflection_at(case.drive, one.controller, string, wide_hz)

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from tdhil.report import TunedFor, tuning_document
-from tdhil.report.tuning import LIGHT_BIT_ERROR_SHARE, SIMULATION_ERROR_SHARE
+from tdhil.report.tuning import JUMPING_BIT_ERROR_SHARE, LIGHT_BIT_ERROR_SHARE, SIMULATION_ERROR_SHARE
 from tdhil.soft_torque import (
     RPM,
     Advice,
@@ -207,18 +207,23 @@ def test_the_critical_speed_above_collars_is_that_of_the_chain_with_the_tick_of_
     assert found == pytest.approx(speeds[~turns].max() + 1.0, rel=0.05)
 
 
-@pytest.mark.parametrize(("inertia_kg_m2", "light"), [(0.0, True), (2.0, True), (40.0, False)])
-def test_grid_and_report_have_one_rule_for_a_light_bit(inertia_kg_m2, light):
-    """Below 8 inch collars (ζ 4,112 N·m·s/rad), half a tick of 6 ms is 12.3 kg·m²."""
-    string = above_collars(2800.0, 200.0, 0.2032, inertia_kg_m2=inertia_kg_m2)
+@pytest.mark.parametrize(("outer_m", "inertia_kg_m2", "light", "share"), [
+    (0.2032, 0.0, True, LIGHT_BIT_ERROR_SHARE), (0.2032, 2.0, True, LIGHT_BIT_ERROR_SHARE),
+    (0.2032, 40.0, False, SIMULATION_ERROR_SHARE), (0.127, 0.0, True, JUMPING_BIT_ERROR_SHARE),
+])
+def test_grid_and_report_have_one_rule_for_a_light_bit(outer_m, inertia_kg_m2, light, share):
+    """Below 8 inch collars (ζ 4,112 N·m·s/rad), half a tick of 6 ms is 12.3 kg·m². Above 5 inch ones, the bit jumps."""
+    string = above_collars(2800.0, 200.0, outer_m, inertia_kg_m2=inertia_kg_m2)
     assert has_light_bit(string, 0.006) is light
     assert (grid_of(string, 0.006).bottom_inertia_kg_m2 == 0.0) is light
     stiff = Tuned("stiff", STIFF, reflection=J, band_reflection=J, damping=J, margins=Margins(60.0, 10.0, 0.5),
                   quiet_cures=(75.0,) * 5)
     case = TuneCase(string, DRIVE, J)
     tuning = Tuning(case, (0.13,), (stiff,), Search(), Advice(None, "stiff", keep=False))
-    (one,) = tuning_document(tuning, TunedFor("x", True, None, 1.0, "drive", "stated"))["controllers"]
-    share = LIGHT_BIT_ERROR_SHARE if light else SIMULATION_ERROR_SHARE
+    document = tuning_document(tuning, TunedFor("x", True, None, 1.0, "drive", "stated"))
+    (one,) = document["controllers"]
+    jumps = [words for words in document["warnings"] if "jumps from speed to speed" in words]
+    assert len(jumps) == (outer_m == 0.127) and all("18 % too low" in words for words in jumps)
     assert one["critical_rpm"]["cure"]["high"] == pytest.approx(75.0 + 0.5 + share * 75.0)
 
 
