@@ -39,7 +39,8 @@ FIGURES: Final = (
     FigureMeaning("loop", "place of the speed loop: in the drive, or in a host"),
     FigureMeaning("ζ", "impedance of the pipe: torque of a wave over its speed"),
     FigureMeaning("echo", "time of a wave from the top down to the bit and back"),
-    FigureMeaning("modes", "frequencies of torsional vibration with the top held", ("f₁",)),
+    FigureMeaning("modes", "frequencies of torsional vibration with the top held"),
+    FigureMeaning("f₁", "the lowest of these frequencies at this depth"),
     FigureMeaning("bit", "its friction: at standstill, turning fast, and between"),
     FigureMeaning("bit noise", "random torque of the bit, root mean square"),
     FigureMeaning("present gains", "source of the gains in the column present"),
@@ -60,12 +61,12 @@ FIGURES: Final = (
     FigureMeaning("a, φ", "softness, frequency factor: P = ζ/a, I = (φω)² (J − J_c)"),
     FigureMeaning("J compensated", "share of J that the speed loop compensates"),
     FigureMeaning("|r|, mean", f"reflection |r| at the lowest mode; mean, {BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz"),
-    FigureMeaning("|r|", "share of a wave that the top sends back: 0 none, 1 all", ("|r| of the top drive",)),
+    FigureMeaning("|r|", "share of a wave that the top sends back: 0 none, 1 all"),
     FigureMeaning("damping ψ", "damping ratio of the least damped mode; 0: no decay",
            ("least damping", "least damping of the lowest modes")),
     FigureMeaning("no noise ψ", "critical speed without noise of the bit"),
     FigureMeaning("J wrong", "damping, and critical speed (cure), if J is wrong so much"),
-    FigureMeaning("bit torque", "torque of a bit that turns fast", ("bit torque, weight on bit",)),
+    FigureMeaning("bit torque", "torque of a bit that turns fast"),
     FigureMeaning("stable", "the bit turns, and comes free if it was stuck"),
     FigureMeaning("at risk", "the bit goes on turning; once stuck, it stays stuck"),
     FigureMeaning("stick-slip", "the bit sticks and slips, again and again"),
@@ -95,11 +96,11 @@ FIGURES: Final = (
 """Every figure in the order in which a card shows it."""
 
 
-def meaning(name: str) -> FigureMeaning | None:
-    """Return the figure of a row or column; None: not explained. Unit, shaft and a percentage do not count."""
+def meaning(name: str) -> tuple[FigureMeaning, str] | None:
+    """Return figure and label of a row or column; None: not explained. Unit, shaft and a percentage do not count."""
     name = re.sub(r" [+−-]?[\d.]+ %", "", name).strip()
-    short = name.split(",")[0]
-    return next((one for label in (name, short) for one in FIGURES if label in (one.name, *one.also)), None)
+    return next(((one, label) for label in (name, name.split(",")[0]) for one in FIGURES
+                 if label in (one.name, *one.also)), None)
 
 
 def words_of(name: str) -> str:
@@ -109,9 +110,14 @@ def words_of(name: str) -> str:
 
 
 def explained(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the figures of the named rows and columns, each once, with their meanings in the order of `FIGURES`."""
-    found = [meaning(name) for name in names]
-    return [(one.name, one.words) for one in FIGURES if one in found]
+    """Return the figures of the named rows and columns, each once, with their meanings in the order of `FIGURES`.
+
+    A figure with one label has this label, and a figure with several ones its own name.
+    """
+    labels: dict[FigureMeaning, set[str]] = {}
+    for figure, label in filter(None, map(meaning, names)):
+        labels.setdefault(figure, set()).add(label)
+    return [(one.name if len(labels[one]) > 1 else min(labels[one]), one.words) for one in FIGURES if one in labels]
 
 
 def print_meanings(names: Iterable[str], console: PlainConsole) -> None:

@@ -145,7 +145,7 @@ def _rows(records: Sequence[Part]) -> Iterator[tuple[str, list[str]]]:
     yield "downhole speed", [f"{one['mean_rpm']:.0f} {_with(one['downhole_swing_rpm'], 0, ' rpm', '±')}"
                              for one in records]
     yield "string torque", [_with(one["string_torque_swing_nm"], 0, " N·m", "±") for one in records]
-    yield "|r| of the top drive", [_reflection(one) for one in records]
+    yield "|r|, top drive", [_reflection(one) for one in records]
     yield "bit noise", [_noise_words(one) for one in records]
 
 

@@ -313,6 +313,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     console.print()
     console.print(figures_table(("", *(one["kind"] for one in document["controllers"] if not one["refused"])),
                                 ((name, *cells) for name, cells in _rows(document))))
+    console.print()
     if document.get("schedule"):
         print_schedule(document["schedule"], console)
     if document.get("map"):

@@ -88,21 +88,23 @@ def names_of(page):
     return [name for name in shown if name and name not in OF_FILES], explained
 
 
+def figures_of(names):
+    return {meaning(name)[0] for name in names}
+
+
 def check(page, printed, own=()):
     """Check that the page explains each of its names, and the card each figure of ``own``, in one line of 80."""
     shown, explained = names_of(page)
     assert [name for name in shown if meaning(name) is None] == []
-    assert {meaning(name).name for name in shown} <= set(explained)
+    assert figures_of(shown) <= figures_of(explained)
     lines = printed.splitlines()
     assert max(map(len, lines)) <= 80
     begin = next(at for at, line in enumerate(lines) if line.startswith(HEADING.lower()))
     block = [line.split("  ")[0] for line in lines[begin + 1 :]]
-    words = {one.name: one.words for one in FIGURES}
-    for name, line in zip(block, lines[begin + 1 :], strict=True):
-        if name not in words:
-            break
-        assert line.strip().endswith(words[name])
-    assert {meaning(name).name for name in own} <= set(block)
+    block = block[: next((at for at, name in enumerate(block) if meaning(name) is None), None)]
+    for name, line in zip(block, lines[begin + 1 :], strict=False):
+        assert line.strip().endswith(meaning(name)[0].words)
+    assert figures_of(own) <= figures_of(block)
 
 
 def shown_by(print_card, document):
