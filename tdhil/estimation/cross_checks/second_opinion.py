@@ -88,11 +88,11 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
             and all(one.agrees is None for one in opinions)):
         # no momentum balance can be compared with J
         hidden = least_torque_scale_change(case.recording, case.samples)
-        what = ("no change in the scale of torque or speed" if hidden is None else
-                f"no change of less than {hidden:.0%} in the scale of torque or speed after stage 2, and none "
+        what = ("a change in the scale of torque or speed" if hidden is None else
+                f"a change of less than {hidden:.0%} in the scale of torque or speed after stage 2, or any change "
                 "within it")
         warnings = (*warnings, CodedText(
-            f"this run shows {what}. If a scale changed, J has an error of that size",
+            f"this run does not show {what}. If a scale changed, J has an error of that size",
             MessageCode.SCALE_CHANGE_HIDDEN))
         if opinions and hidden is not None:
             opinions = (replace(opinions[0], least_scale_change=hidden), *opinions[1:])
