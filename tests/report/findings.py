@@ -62,7 +62,7 @@ def full():
             BudgetLine("torque scale", 4.1, "2 % (1 sd)"),
         ),
         second_opinions=(
-            SecondOpinion("speed change", around(130.6, 2.3), True, "3 changes of speed"),
+            SecondOpinion("speed change", around(130.6, 2.3), True, "3 changes of speed", 0.29),
             SecondOpinion("coast-down", around(90.0, 3.0), False, "1 change of speed without torque"),
         ),
         friction_curve=tuple(FrictionPoint(speed, around(torque, half)) for speed, torque, half in points),
