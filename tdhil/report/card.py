@@ -169,7 +169,7 @@ def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         value = estimate_text(opinion["inertia_kg_m2"], "kg·m²")
         yield MOMENTUM_CROSS_CHECK, Text.assemble(f"{value}  ", (word, style), f", {opinion['route']}")
         if (least := opinion.get("least_scale_change")) is not None:
-            yield "scale change", f"of torque or speed in mid-run: {100.0 * least:.0f} % or more would show"
+            yield "scale change", f"of torque or speed: {100.0 * least:.0f} % or more would show"
 
 
 def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[Row]:

@@ -55,7 +55,7 @@ def test_every_part_is_shown():
         "130.0 (128.0 to 132.0) kg·m²", "500 (480 to 520) N·m/rad", "left open by the data",
         "2.90 rad/s: 83.1 ± 1.5", "7.00 rad/s: 116.20 ± 0.80",
         "130.6 (128.3 to 132.9) kg·m²  agrees, speed change", "DOES NOT AGREE, coast-down",
-        "of torque or speed in mid-run: 29 % or more would show",
+        "of torque or speed: 29 % or more would show",
         "uncertainty budget", "momentum cross-check", "acceleration", "regression (Xu 2026)", "lag, reported speed",
         "time offset", "! friction <b>bends</b> & more",
     ):
