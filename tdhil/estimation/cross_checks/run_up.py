@@ -30,9 +30,9 @@ _FILTER_S = 2.0           # s; time before stage 2 in which the lags forget thei
 _STEADY_S = 3.0           # s; time at the first steady speed that is used
 _LEAST_SPEED = 0.15       # of the first steady speed: below it friction may depend strongly on speed (Stribeck)
 _FEWEST = 8               # fewest blocks
-_COARSEST = 0.25
-"""Largest half-width of J, as a share of J. Noise of the speed, which is a regressor, makes J too small where it matters
-this much: by half with a half-width of 48 % (`benchmarks/healthy_runs.py`, seed 441)."""
+_MOST_NOISE = 0.1
+"""Largest share of noise in the part of Δω/Δt that determines J. Noise of a regressor makes J too small by this share:
+by half on seed 441 of `benchmarks/healthy_runs.py`."""
 _MODEL_SD = 0.05
 """Standard uncertainty of J due to nonlinear friction and filters of more than one pole, as a share of J. On 48 healthy
 rigs without a string, J of the run-up was at most 1.3 standard uncertainties off (`benchmarks/healthy_runs.py`)."""
@@ -60,8 +60,10 @@ def run_up_inertia(
     steady = float(np.mean(part.speed_rad_s[part.time_s >= calm.start_s]))
     per_block = max(2, round(_BLOCK_S / interval_s))
 
-    def solved(more_s: float) -> tuple[FloatArray, FloatArray, float, int] | None:
-        """Return J, B and T_c, their covariance for blocks of unit variance, the residual and the number of blocks."""
+    def solved(more_s: float) -> tuple[FloatArray, FloatArray, float, int, float] | None:
+        """Return J, B and T_c, their covariance for blocks of unit variance, the residual, the number of blocks, and
+        the share of noise in Δω/Δt.
+        """
         torque = lagged(part.torque_nm, interval_s, lags_s[0] + more_s)
         speed = lagged(part.speed_rad_s, interval_s, lags_s[1])
         slow = np.flatnonzero(
@@ -75,20 +77,21 @@ def run_up_inertia(
         design = np.column_stack([np.diff(speed[edges]) / took_s, travel, np.ones(len(took_s))])
         spread = np.linalg.inv(design.T @ design)
         x = spread @ design.T @ impulse
-        return x, spread, float(np.sum((impulse - design @ x) ** 2)), len(took_s)
+        noise = float(np.var(design[part.time_s[edges[:-1]] >= calm.start_s, 0])) * len(took_s) * float(spread[0, 0])
+        return x, spread, float(np.sum((impulse - design @ x) ** 2)), len(took_s), noise
 
     fitted, later = solved(0.0), solved(delay.sd_s)
     if fitted is None or later is None or not fitted[0][0] > 0.0:
         return None
-    x, spread, rest, count = fitted
+    x, spread, rest, count, noise = fitted
+    if not noise <= _MOST_NOISE:
+        return None
     dof, block_s = float(count - 3), per_block * interval_s
     density = Density(max(rest / dof * block_s, levels.value), dof)
     inertia = float(x[0])
     shifted = abs(float(later[0][0] - x[0]))
-    half = math.hypot(
+    half = noise * inertia + math.hypot(
         student_quantile(confidence, dof) * math.sqrt(density.value / block_s * float(spread[0, 0])),
         student_quantile(confidence, 1e6) * math.hypot(shifted, math.hypot(reading.value, reading.sd) * inertia),
     )
-    if half > _COARSEST * inertia:
-        return None
     return MomentumFit(inertia, half, shifted, float(x[1]), 1, density, _MODEL_SD * inertia)
