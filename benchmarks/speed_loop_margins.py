@@ -9,8 +9,10 @@ rigs are scaled to their resonance, so that it decides the gains in many of them
 
 The truth is judged by python-control, which shares no code with `tdhil.speed_loop`: plant by its matrices, dead time
 by a Padé approximation of sixth order, all crossovers. Printed: rigs whose true margins are at least the promised ones;
-the thinnest true margins; the tuned P over the P that would fit if everything were known; refusals. The exit code is 1
-if less than 95 % keep the promise, beyond what chance allows (one-sided 99 %, Clopper and Pearson).
+the thinnest true margins; the tuned P over the P that would fit if everything were known; refusals.
+
+Required of each kind, rigid and two-mass: the observed share of tuned rigs that keep the promise is at least 95 %, and
+at most 10 % of the rigs are refused. The exit code is 1 otherwise, also for a kind without a rig.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import argparse
 import sys
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from math import pi
 from pathlib import Path
@@ -29,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import control
 import numpy as np
 
+from benchmarks.shares import met
 from tdhil.cli.tune_speed import plant_of
 from tdhil.estimation import identify
 from tdhil.recording.recording import Recording
@@ -50,7 +54,8 @@ from tests.speed_loop.by_control import true_margins
 
 STATED_SD = 0.05
 """Relative standard uncertainty of each stated lag."""
-LEAST_KEPT = 0.95
+LEAST_KEPT = 0.95          # of the tuned rigs of a kind; issue 29
+MOST_REFUSED = 0.10        # of the rigs of a kind; a choice: a refused rig is in no other share
 PHASE_TOLERANCE_DEG, GAIN_TOLERANCE_DB = 0.05, 0.02
 """Numerical error of the margins on both sides."""
 
@@ -155,28 +160,26 @@ def main() -> int:
             print(f"    {rows[-1]}", flush=True)
         if len(rows) % 10 == 0:
             print(f"    {len(rows)} rigs, {time.monotonic() - begun:.0f} s", flush=True)
+    good = kept(rows, asked.phase_margin, asked.gain_margin)
+    print(f"{len(rows)} rigs, {time.monotonic() - begun:.0f} s (python-control {control.__version__})")
+    return 0 if good else 1
+
+
+def kept(rows: Sequence[dict[str, Any]], phase_deg: float, gain_db: float) -> bool:
+    """Print the figures of each kind. Return whether each meets its requirements."""
+    good = True
     for kind in ("rigid", "two-mass"):
         some = [row for row in rows if row["kind"] == kind]
         tuned = [row for row in some if not row["refused"]]
+        print(f"{kind}: {len(some)} rigs, {sum(row['notch'] for row in tuned)} tuned with a notch")
         if tuned:
-            kept = sum(row["kept"] for row in tuned)
-            thinnest = (min(row[name] for row in tuned) for name in ("phase_deg", "gain_db"))
-            print(f"{kind:>9}: {len(some)} rigs, {len(some) - len(tuned)} refused, {kept} of {len(tuned)} keep "
-                  f"{asked.phase_margin:g}° and {asked.gain_margin:g} dB; thinnest {next(thinnest):.1f}° and "
-                  f"{next(thinnest):.1f} dB; P / P of known rigs {np.median([row['share'] for row in tuned]):.2f} in "
-                  f"the median; {sum(row['notch'] for row in tuned)} with a notch", flush=True)
-    tuned = [row for row in rows if not row["refused"]]
-    kept = sum(row["kept"] for row in tuned)
-    print(f"      all: {kept} of {len(tuned)} keep the promise, {time.monotonic() - begun:.0f} s "
-          f"(python-control {control.__version__})")
-    return 0 if tuned and upper_bound(kept, len(tuned)) >= LEAST_KEPT else 1
-
-
-def upper_bound(count: int, of: int) -> float:
-    """Return the one-sided 99 % bound of a share."""
-    from scipy.stats import beta
-
-    return 1.0 if count == of else float(beta.ppf(0.99, count + 1, of - count))
+            thinnest = [min(row[name] for row in tuned) for name in ("phase_deg", "gain_db")]
+            print(f"    thinnest {thinnest[0]:.1f}° and {thinnest[1]:.1f} dB; P / P of known rigs "
+                  f"{np.median([row['share'] for row in tuned]):.2f} in the median")
+        good &= met(f"keep {phase_deg:g}° and {gain_db:g} dB", sum(row["kept"] for row in tuned), len(tuned),
+                    least=LEAST_KEPT)
+        good &= met("refused", len(some) - len(tuned), len(some), most=MOST_REFUSED)
+    return good
 
 
 if __name__ == "__main__":

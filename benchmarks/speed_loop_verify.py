@@ -1,6 +1,6 @@
 """`tdhil tune verify` on random rigs: typed gains agree, gains typed wrongly by 30 % are found.
 
-    python benchmarks/speed_loop_verify.py --out rows.jsonl [--rigs 300] [--two-mass 0] [--first 1]
+    python benchmarks/speed_loop_verify.py --out rows.jsonl [--rigs 150] [--two-mass 150] [--first 1]
 
 J, friction, lags of the reports, noise and lags of the speed loop are random. Each rig is recorded by a test bench that
 shares no code with the estimator, identified, and tuned from the result: half of the rigs for the largest bandwidth,
@@ -10,14 +10,14 @@ Then the simulated drive gets the tuned gains, and runs `tdhil tune verify` as a
 multiplied by 0.7 or 1.3. Each rig is one line of the file; rigs that the file has are skipped. Printed for each kind of
 shaft: agreement with typed gains, wrong gains found by kind of error, and runs that cannot tell, with their share.
 
-`--two-mass`: rigs of two masses on a coupling, after the rigid ones: resonances of 3 to 20 Hz, above the excited lines.
-The simulated drive itself is identified, J is that of both masses, and the requested bandwidth is within the excited
-lines, as `tdhil tune speed` advises (TDH-055). A shaft that oscillates at some tenths of a hertz is a drill string:
-speed steps are refused above one.
+`--two-mass`: rigs of two masses on a coupling, beside the rigid ones: resonances of 3 to 20 Hz, above the excited
+lines. The simulated drive itself is identified, J is that of both masses, and the requested bandwidth is within the
+excited lines, as `tdhil tune speed` advises (TDH-055). A shaft that oscillates at some tenths of a hertz is a drill
+string: speed steps are refused above one.
 
-The exit code is 1 if less than 95 % of typed gains agree or less than 90 % of wrong gains are found, beyond what chance
-allows (one-sided 99 %, Clopper and Pearson). Both are judged twice, of each kind of shaft: of all runs, which is the
-proof, and of the runs that can tell.
+Required of each kind of shaft, by observed shares: at least 95 % of typed gains agree, and at least 90 % of wrong gains
+are found, both of all runs, which is the proof, and of the runs that can tell. `tune speed` refuses at most 10 % of the
+rigs. The exit code is 1 otherwise, also for a kind without a rig.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 
 from benchmarks.kept_rows import kept_rows
-from benchmarks.speed_loop_margins import drawn_rig, stated, upper_bound
+from benchmarks.shares import met
+from benchmarks.speed_loop_margins import MOST_REFUSED, drawn_rig, stated
 from tdhil.cli.tune_speed import plant_of
 from tdhil.estimation import identify
 from tdhil.report import LoopTunedFor, loop_document, result_document
@@ -50,7 +51,7 @@ from tests.estimation import shaft_bench
 from tests.estimation.planned_motions import planned
 
 WRONG = {"P": (True, False), "I": (False, True), "P and I": (True, True)}
-LEAST_AGREE, LEAST_FOUND = 0.95, 0.90
+LEAST_AGREE, LEAST_FOUND = 0.95, 0.90     # of the runs of a kind of shaft; issue 29
 CONTROL_PERIOD_S = 0.002
 LEAST_LAG_S = 0.05         # of the reported speed and torque
 COUPLING_RIG = {"load": "none", "limits": {"speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 400.0,
@@ -172,8 +173,8 @@ def judged(seed: int) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--rigs", type=int, default=300)
-    parser.add_argument("--two-mass", type=int, default=0, help="rigs of two masses")
+    parser.add_argument("--rigs", type=int, default=150, help="rigid ones")
+    parser.add_argument("--two-mass", type=int, default=150, help="rigs of two masses")
     parser.add_argument("--first", type=int, default=1)
     asked = parser.parse_args()
     begun = time.monotonic()
@@ -190,31 +191,23 @@ def main() -> int:
 
 
 def told(rows: Sequence[dict[str, Any]]) -> int:
-    """Print the shares. Return the exit code."""
-    kinds = {shaft: [row for row in rows if row.get("shaft", "rigid") == shaft] for shaft in ("rigid", "two-mass")}
-    good = [_kept(shaft, own) for shaft, own in kinds.items() if own]
-    return 0 if good and all(good) else 1
-
-
-def _kept(shaft: str, rows: Sequence[dict[str, Any]]) -> bool:
-    """Print the shares of one kind of shaft. Return whether they are as required."""
-    some = [row for row in rows if not row["refused"]]
-    print(f"{shaft}: {len(rows)} rigs, {len(rows) - len(some)} refused by tune speed")
-    kept = bool(some)
-    for run, right, least in (("typed", "agrees", LEAST_AGREE), ("wrong", "differs", LEAST_FOUND)):
-        verdicts = [row[run]["verdict"] for row in some]
-        hits, open_ = verdicts.count(right), verdicts.count("cannot_tell")
-        for of, count in (("all, the proof", len(some)), ("those that can tell", len(some) - open_)):
-            met = count > 0 and upper_bound(hits, count) >= least
-            kept &= met
-            limit = "" if met else f" NOT MET: at least {least:.0%}"
-            print(f"    {run} gains: {hits} of {count} {right} ({of}){limit}")
-        print(f"    {run} gains: {open_} cannot_tell, {open_ / max(1, len(some)):.1%}; "
-              f"{len(some) - hits - open_} another verdict or ended")
-    for kind in WRONG:
-        of_kind = [row["wrong"]["verdict"] for row in some if row["kind"] == kind]
-        print(f"    {kind} wrong: {of_kind.count('differs')} of {len(of_kind)} found")
-    return kept
+    """Print the shares of each kind of shaft. Return the exit code."""
+    good = True
+    for shaft in ("rigid", "two-mass"):
+        own = [row for row in rows if row.get("shaft", "rigid") == shaft]
+        some = [row for row in own if not row["refused"]]
+        print(f"{shaft}: {len(own)} rigs")
+        good &= met("refused by identify or tune speed", len(own) - len(some), len(own), most=MOST_REFUSED)
+        for run, right, least in (("typed", "agrees", LEAST_AGREE), ("wrong", "differs", LEAST_FOUND)):
+            verdicts = [row[run]["verdict"] for row in some]
+            hits, open_ = verdicts.count(right), verdicts.count("cannot_tell")
+            for of, count in (("all, the proof", len(some)), ("those that can tell", len(some) - open_)):
+                good &= met(f"{run} gains {right}, of {of}", hits, count, least=least)
+            print(f"    {run} gains: {open_} cannot_tell; {len(some) - hits - open_} another verdict or ended")
+        for kind in WRONG:
+            of_kind = [row["wrong"]["verdict"] for row in some if row["kind"] == kind]
+            print(f"    {kind} wrong: {of_kind.count('differs')} of {len(of_kind)} found")
+    return 0 if good else 1
 
 
 if __name__ == "__main__":
