@@ -5,11 +5,15 @@
 
 ``coverage``: each run goes through the five stages as in `tolerance_coverage.py`, and J is identified after every
 period. It prints how often an interval misses, over all moments, by the number of periods, and how often any of a run
-misses: that is what stopping at a chosen moment may cost, and why only ``--tolerance`` may do it.
+misses: that is what stopping at a chosen moment may cost, and why only ``--tolerance`` may do it. Required: at most 5 %
+of all intervals miss, no run ends early by a fault, and each run has an interval.
 
 ``late``: whole runs in real time on the embedded simulator, by turns with J and without. It prints the cycles that
-began late or had no feedback in time, and the worker process's share of a core. The exit code is 1 if the share of runs
-with J is more than 5 % of a core above that of runs without.
+began late or had no feedback in time, and the worker process's share of a core. Required: the share of runs with J is
+at most 5 % of a core above that of runs without, and their cycles are not late more often than chance explains
+(Fisher's exact test, one-sided, 1 %).
+
+The exit code is 1 if a requirement is not met.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import tdhil
 from benchmarks.real_time_priority import busy_loops
+from benchmarks.shares import met
 from benchmarks.tolerance_coverage import bounds, over_seeds
 from sim_bus.params import RigParams
 from tdhil.recording import LiveInertia
@@ -39,7 +45,9 @@ from tests.runner.fake_drive import FakeDisplay
 from tests.runner.inverter_runs import LIMITS, TRUE_KG_M2, InverterDrive
 from tests.runner.line_drive import BuilderLog
 
-MOST_SHARE = 0.05       # of a core, for J during the run
+MOST_SHARE = 0.05       # of a core, for J during the run; issue 29
+MOST_MISSED = 0.05      # of all intervals; issue 29
+CHANCE = 0.01           # p-value below which cycles with J are late more often
 
 
 class Viewer(FakeDisplay):
@@ -84,13 +92,16 @@ def course(seed: int, fixed_s: float, tolerance: float | None) -> Course:
 
 
 def coverage(asked: argparse.Namespace) -> int:
-    """Print the misses; 1 if more than 5 % of all intervals miss, beyond chance."""
+    """Run the study. Return 1 if a requirement is not met."""
     found: list[Course] = []
     for one in over_seeds(course, asked):
         found.append(one)
         print(f"{one.seed:>5} {len(one.numbers)} intervals, {len(one.missed)} miss {one.note}", flush=True)
-    whole = [one for each in found for one in each.numbers]
-    missed = [one for each in found for one in each.missed]
+    return 0 if covered(found) else 1
+
+
+def covered(found: Sequence[Course]) -> bool:
+    """Print the misses, and the runs that ended early or have no interval. Return whether all is as required."""
     by_periods: dict[int, list[int]] = {}
     for each in found:
         for one in each.numbers:
@@ -100,12 +111,15 @@ def coverage(asked: argparse.Namespace) -> int:
     print("periods: intervals, misses")
     for periods, (count, out) in sorted(by_periods.items()):
         print(f"{periods:>7}: {count:>5} {out:>4}  {100 * out / count:.1f} %")
-    low, high = bounds(len(missed), len(whole))
-    some = sum(bool(one.missed) for one in found)
-    print(f"{len(found)} runs, {len(whole)} intervals: {len(missed)} miss, {100 * len(missed) / len(whole):.2f} %"
-          f" (99 % if they were independent: {100 * low:.2f} to {100 * high:.2f} %)")
-    print(f"any interval of a run misses: {some} of {len(found)} runs, {100 * some / len(found):.1f} %")
-    return 0 if len(missed) <= 0.05 * len(whole) else 1
+    whole, missed = sum(len(one.numbers) for one in found), sum(len(one.missed) for one in found)
+    if whole:
+        low, high = bounds(missed, whole)
+        print(f"misses, 99 % if they were independent: {100 * low:.2f} to {100 * high:.2f} %")
+    print(f"any interval of a run misses: {sum(bool(one.missed) for one in found)} of {len(found)} runs")
+    return all([
+        met("intervals that miss", missed, whole, most=MOST_MISSED),
+        met("runs that ended early", sum(bool(one.note) for one in found), len(found), most=0.0),
+        met("runs without an interval", sum(not one.numbers for one in found), len(found), most=0.0)])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -133,7 +147,7 @@ def one_round(shown: bool, rate_hz: float, periods: int, seed: int) -> tuple[int
 
 
 def late(asked: argparse.Namespace) -> int:
-    """Print the late cycles with J and without, and the worker's share of a core; 1 if J adds more than 5 % to it."""
+    """Print the late cycles with J and without, and the worker's share of a core. Return 1 if J adds to either."""
     totals = {False: [0, 0], True: [0, 0]}
     shares: dict[bool, list[float]] = {False: [], True: []}
     with busy_loops(asked.hogs):
@@ -152,7 +166,22 @@ def late(asked: argparse.Namespace) -> int:
     print(f"{os.cpu_count()} cores, {asked.hogs} busy loops beside it, {asked.rate:g} Hz")
     more = statistics.mean(shares[True]) - statistics.mean(shares[False])
     print(f"J takes {100 * more:.2f} % of a core in the worker process (limit {100 * MOST_SHARE:g} %)")
-    return 0 if more <= MOST_SHARE else 1
+    return 0 if late_by_chance(totals[True], totals[False]) and more <= MOST_SHARE else 1
+
+
+def late_by_chance(shown: Sequence[int], plain: Sequence[int]) -> bool:
+    """Print whether cycles with J are late more often than without; each is (cycles, late). True if chance explains it.
+
+    Late cycles come in groups, so this test is stricter than its level.
+    """
+    from scipy.stats import fisher_exact
+
+    if not (shown[0] and plain[0]):
+        return False
+    table = [[late, max(cycles - late, 0)] for cycles, late in (shown, plain)]
+    chance = float(fisher_exact(table, alternative="greater").pvalue)
+    print(f"as many late cycles with J by chance: p = {chance:.2g} (limit {CHANCE:g})")
+    return chance >= CHANCE
 
 
 def main() -> int:
