@@ -2,10 +2,12 @@
 
     python benchmarks/frf_speed.py [--hours 1.0] [--rate 1000]
 
-The record is that of benchmarks/identify_speed.py. Printed: the identification as a whole, the response alone
-(unexcited harmonics, tests, intervals, the curve of the model), and both in least-squares fits of three columns on the
-same arrays. The best of three counts. The exit code is 1 if the response alone takes more than a tenth of the
-identification, or more than 2 s for 3.6 million samples.
+The record is that of benchmarks/identify_speed.py. Printed: the identification as a whole, which `tdhil frf` and
+`result.frf` wait for, the response alone (unexcited harmonics, tests, intervals, the curve of the model), and both in
+least-squares fits of three columns on the same arrays. The best of three counts.
+
+Required (decision 0039): the response alone takes at most a tenth of the identification, and 2 s for 3.6 million
+samples; the identification with its response takes at most 10 fits. The exit code is 1 otherwise.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")     # as `tdhil` has it
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.identify_speed import best_s, fit_s, synthesised
+from benchmarks.identify_speed import MOST_FITS, best_s, fit_s, synthesised
 from tdhil.estimation import Options, identify
 from tdhil.estimation.case import Case
 from tdhil.estimation.frequency_domain import measure_response
@@ -26,7 +28,7 @@ from tdhil.estimation.identification import sampled
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
 
 MOST_SHARE = 0.1         # of the identification
-MOST_S = 2.0             # for an hour at 1 kHz; a shorter record has a part of it
+MOST_S = 2.0             # for an hour at 1 kHz (issue 29); a shorter record has a part of it
 
 
 def main() -> int:
@@ -43,8 +45,8 @@ def main() -> int:
     print(f"{len(recording.time_s)} samples: identification with response {whole:.2f} s ({whole / fit:.1f} fits), "
           f"the response alone {alone:.3f} s ({alone / fit:.2f} fits, {alone / whole:.1%} of it)")
     most_s = MOST_S * len(recording.time_s) / 3.6e6
-    print(f"required: at most {MOST_SHARE:.0%} of the identification, and {most_s:.3g} s")
-    return 0 if alone <= MOST_SHARE * whole and alone <= most_s else 1
+    print(f"required: at most {MOST_FITS:g} fits; alone {MOST_SHARE:.0%} of the identification, and {most_s:.3g} s")
+    return 0 if whole <= MOST_FITS * fit and alone <= MOST_SHARE * whole and alone <= most_s else 1
 
 
 if __name__ == "__main__":
