@@ -6,7 +6,7 @@
 
 Each constant is multiplied by 2/3, then by 4/3, while its module is imported; nothing in the checkout is written. The
 tests of its room run in a process of their own, those named after the module first, up to the first failure. A number
-that no test notices needs one, or goes, unless its own text says that it is a choice. Whole numbers up to `SMALLEST`
+that no test notices needs a test, or goes. Whole numbers up to `SMALLEST`
 are left out: most are positions. A room takes minutes for each number that no test notices: a night takes a sample.
 """
 

@@ -1,18 +1,21 @@
 """Module-level numeric constants that state neither their meaning nor their source.
 
 ``python -m tests.packaging.constants FOLDER`` lists them. A constant states it by a docstring below, or by a comment on
-its line. Several names in one statement share both.
+its line; a directive to a tool is no comment. Several names in one statement share both.
 """
 
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+_WORD = re.compile(r"[^\W\d_]")
+_DIRECTIVE = re.compile(r"\s*(?:noqa|type:|pragma:|ruff:)")
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,8 @@ def bare_constants(path: Path) -> Iterator[Bare]:
         after = body[at + 1] if at + 1 < len(body) else None
         stated = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(
             after.value.value, str)
-        if not stated and "#" not in lines[(node.end_lineno or node.lineno) - 1]:
+        comments = lines[(node.end_lineno or node.lineno) - 1].split("#")[1:]
+        if not stated and not any(_WORD.search(one) and not _DIRECTIVE.match(one) for one in comments):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             yield Bare(path, node.lineno, ", ".join(ast.unparse(one).strip("()") for one in targets))
 

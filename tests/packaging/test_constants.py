@@ -19,6 +19,7 @@ def test_no_number_is_without_a_word():
     ("A = 1.0\n", ["A"]), ("A = 1.0   # s\n", []), ('A = 1.0\n"""A time, s."""\n', []),
     ("_A, B = -1, 2.5\n", ["_A, B"]), ('A = (1, 2)\nB = 2.0\n"""s."""\n', ["A"]),
     ("A = True\nB = 'x'\nC = f(1)\n", []), ("A: float = 2 * 3.0\n", ["A"]),
+    ("A = 1.0  # noqa: PLR2004\n", ["A"]), ("A = 1.0  # noqa: PLR2004  # s\n", []), ("A = 1.0  #\n", ["A"]),
 ])
 def test_what_counts_as_a_number_without_a_word(tmp_path, source, names):
     path = tmp_path / "module.py"
