@@ -58,6 +58,9 @@ def response_sentences(found: Part) -> tuple[str, ...]:
         said.append(f"Nonlinear distortion was detected (p = {distortion['p_value']:.1g}, {where}); "
                     "the intervals include it.")
         said.extend(_causes(distortion))
+        if found.get("realisations", 1) == 1:
+            said.append("One set of phases does not measure the distortion of the lines themselves: the intervals of "
+                        "weak lines may be too narrow. Measure it by a multisine with --realisations 2.")
     return tuple(said)
 
 

@@ -6,6 +6,7 @@ import csv
 import json
 import struct
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -74,6 +75,8 @@ def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsy
     assert found == [(line["hertz"], line["phase_rad"]["value"], trace[0]) for line in lines]
     head = picture.read_bytes()
     assert head.startswith(b"\x89PNG") and struct.unpack(">II", head[16:24])[0] > 900
+    assert main(["frf", *trace, "--plot", str(tmp_path / "frf.svg")]) == 0
+    assert ElementTree.parse(tmp_path / "frf.svg").getroot().tag.endswith("}svg")
 
 
 @pytest.mark.heavy

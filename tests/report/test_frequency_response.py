@@ -1,0 +1,43 @@
+"""The frequency response in a report: its figure and its sentences, and the advice where distortion was detected."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tdhil.estimation import identify
+from tdhil.report.blocks import Picture, report_of
+from tdhil.report.document import result_document
+from tdhil.report.frequency_response import response_sentences
+from tests.estimation.analytic import closed_form
+from tests.estimation.test_frequency_response import with_torque
+from tests.report.findings import RUN
+
+ADVICE = "--realisations 2"
+
+
+@cache
+def measured(distorted):
+    """Return a recording of a rigid shaft, and its document. ``distorted``: with a torque beside the excited lines."""
+    recording = closed_form(noise=3.0)
+    if distorted:
+        recording = with_torque(recording, lambda t, _: 2.0 * np.cos(2.0 * np.pi * 0.5 * t))
+    return recording, result_document(identify(recording), recording, RUN, "run.mcap")
+
+
+def test_a_report_shows_the_response_and_its_sentences():
+    recording, document = measured(False)
+    (section,) = (one for one in report_of(document, recording).sections if one.heading == "Frequency response")
+    (picture,) = (block for block in section.blocks if isinstance(block, Picture))
+    assert picture.graph == "response"
+    assert " ".join(response_sentences(document["frequency_response"])) in picture.about
+
+
+@pytest.mark.parametrize(("distorted", "sets", "advised"), [(True, 1, True), (True, 2, False), (False, 1, False)])
+def test_a_second_set_of_phases_is_advised_where_one_showed_distortion(distorted, sets, advised):
+    _, document = measured(distorted)
+    response = document["frequency_response"]
+    assert (response["distortion"]["detected"], response["realisations"]) == (distorted, 1)
+    assert (ADVICE in " ".join(response_sentences(response | {"realisations": sets}))) is advised
