@@ -266,7 +266,7 @@ FILES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*
                if path.suffix in (".py", ".js", ".html") and "uPlot" not in path.name)
 
 
-@pytest.mark.heavy(but_first=58)
+@pytest.mark.heavy(but_first=58, each_share=True)
 @pytest.mark.parametrize("file", FILES)
 def test_no_name_of_an_option_stands_in_a_second_file(file):
     if file in DECLARED:

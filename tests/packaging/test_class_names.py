@@ -38,7 +38,7 @@ SHARED = {
 }
 
 
-@pytest.mark.heavy
+@pytest.mark.heavy(each_share=True)
 def test_no_two_classes_have_one_name():
     found = defaultdict(list)
     for room in ROOMS:

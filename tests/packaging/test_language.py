@@ -28,7 +28,7 @@ def counts():
     return counted()
 
 
-@pytest.mark.heavy
+@pytest.mark.heavy(each_share=True)
 def test_no_room_gets_less_plain(counts):
     """A new text follows the rules; `python -m tests.packaging.language ROOM` lists what a room has."""
     above = {key: (number, CEILINGS.get(key, 0)) for key, number in counts.items() if number > CEILINGS.get(key, 0)}

@@ -50,7 +50,7 @@ def parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return len([name for name in names if name not in ("self", "cls")])
 
 
-@pytest.mark.heavy
+@pytest.mark.heavy(each_share=True)
 def test_no_function_takes_more_than_eight_parameters():
     found = {}
     for room in ROOMS:
