@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from drivers import CommunicationLost
+from tdhil.cli.main import main
 from tdhil.recording import LiveInertia, LogNews
 from tdhil.service.live_feed import EVERY_S, MOST, SPACING_S, Feed, LivePicture
 from tdhil.service.run_state import Entered, State, Status
@@ -140,6 +141,25 @@ def test_a_viewer_gets_all_of_it_from_the_start(service):
     assert events == ["half of it"]
     assert seen[0] == 0.0
     assert len(seen) >= 40
+
+
+@pytest.mark.heavy
+def test_the_last_live_value_of_a_whole_run_is_that_of_its_result(service, tmp_path, capsys):
+    log = tmp_path / "run.mcap"
+    assert main(["identify", "--simulate", "--seed", "7", "--max-time", "150", "--json", "--log", str(log)]) == 0
+    result = json.loads(capsys.readouterr().out)["inertia_kg_m2"]
+    with TestClient(service.web.asgi, base_url=URL) as client:
+        run = client.post(f"{API}/rigs/a/runs", json={"note": "hold"}).json()["id"]
+        service.wait(run, "moving")
+        log.replace(service.store.place(run) / "run.mcap")
+        shown, end_s = [], time.monotonic() + 30.0
+        with client.websocket_connect(f"{LIVE}/{run}") as socket:
+            while not shown and time.monotonic() < end_s:
+                shown += socket.receive_json().get("inertias", [])
+        client.post(f"{API}/runs/{run}/stop", json={})
+    for key, live in (("value", "inertia_kg_m2"), ("low", "low_kg_m2"), ("high", "high_kg_m2"),
+                      ("low_total", "low_total_kg_m2"), ("high_total", "high_total_kg_m2")):
+        assert shown[-1][live] == pytest.approx(result[key], rel=1e-9)
 
 
 class Gone:
