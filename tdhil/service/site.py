@@ -23,7 +23,7 @@ from tdhil.config import STATED
 from tdhil.errors import TdhilError
 from tdhil.service.acceptance_signature import FILE as SIGNATURE_FILE
 from tdhil.service.access import Access
-from tdhil.service.answers import KeptAnswers
+from tdhil.service.document_cache import DocumentCache
 from tdhil.service.evidence_request import ABOUT, ARCHIVE, evidence_in
 from tdhil.service.fleets import Fleets
 from tdhil.service.letterhead import outdated_reports
@@ -107,7 +107,7 @@ class Site:
         self._stops = ThreadPoolExecutor(STOPS, "stop")
         self._stopping = 0
         self._shared_stops: dict[str, asyncio.Task[Any]] = {}
-        self._answers = KeptAnswers(self.store.runs)
+        self._documents = DocumentCache(self.store.runs)
         self._works = anyio.CapacityLimiter(1)         # computations that a page waits for, one at a time
         self._replays = anyio.CapacityLimiter(1)       # slow computations, so that no plan waits for them
         self._previews = anyio.CapacityLimiter(1)      # a large upload takes long to read
@@ -159,8 +159,8 @@ class Site:
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Compute a task, one at a time. Return its document; from the cache if it can't differ. Raises Refused."""
-        key = self._answers.key(what, asked)
-        if (kept := self._answers.get(key)) is not None:
+        key = self._documents.key(what, asked)
+        if (kept := self._documents.get(key)) is not None:
             return kept
         work, limiter = partial(self.supervisor.work, what, run, asked), self._works
         if what in ("replay", "calibrate", "upload", "evidence"):
@@ -168,7 +168,7 @@ class Site:
         if what == "preview":
             limiter = self._previews
         found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=limiter))["document"]
-        self._answers.put(key, found)
+        self._documents.put(key, found)
         return found
 
     def rig_view(self, rig: RigFile) -> RigView:

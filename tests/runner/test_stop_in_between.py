@@ -105,7 +105,7 @@ def test_time_without_feedback_counts_where_speed_mode_is_not_followed():
     assert here.bench.now_s < 60.0
 
 
-def test_without_feedback_nothing_is_let_go():
+def test_without_feedback_no_torque_is_released():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=not 150 <= drive.cycles < 160)
     assert here.stop_sequence().run().confirmed
@@ -114,7 +114,7 @@ def test_without_feedback_nothing_is_let_go():
     assert here.drive.commands[165].speed_rad_s != 0.0
 
 
-def test_a_fault_while_torque_is_let_go_ends_that_and_is_told_once():
+def test_a_fault_during_the_release_of_torque_ends_it_and_is_reported_once():
     here = StringWorld(twist_nm=300.0)
 
     def faults(drive, sample):

@@ -68,7 +68,7 @@ def test_without_standstill_the_quick_stop_is_left_and_that_is_loud(world):
     assert any("quick stop instead, which may not brake" in line for line in report.trouble)
 
 
-def test_a_string_is_let_go_on_the_ramp():
+def test_trapped_torque_is_released_on_the_ramp():
     here = wound_up()
     report = here.stop_sequence().run()
     assert report.confirmed and report.stayed_in_torque_mode, report.trouble

@@ -286,7 +286,7 @@ def test_torque_about_zero_has_no_side_that_it_could_change():
 
 @settings(max_examples=25, deadline=None)
 @given(stiffness=st.floats(20.0, 20_000.0), lag_s=st.sampled_from([0.0, 0.15, 0.4]), trapped=st.floats(-380.0, 380.0))
-def test_any_string_is_let_go_behind_any_plausible_lag(stiffness, lag_s, trapped):
+def test_trapped_torque_of_any_string_is_released_behind_any_plausible_lag(stiffness, lag_s, trapped):
     """From 20 to 20 000 N·m/rad, the torque seen through a lag and the speed followed through another."""
     going, angle, seen, speed = letting_go(), trapped / stiffness, trapped, 0.0
     for _ in range(round(going.longest_s / 0.02) + 4000):

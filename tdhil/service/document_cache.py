@@ -13,7 +13,7 @@ MOST: Final = 64
 """Largest number of cached documents; a comparison of eight runs has about 100 kB."""
 
 
-class KeptAnswers:
+class DocumentCache:
     """Cache of the latest documents of `plan`, `trend` and `compare`. Each depends on its request and files only."""
 
     def __init__(self, runs: Path) -> None:

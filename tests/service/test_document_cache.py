@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from tdhil.service.answers import MOST, KeptAnswers
+from tdhil.service.document_cache import MOST, DocumentCache
 
 
 def test_a_comparison_is_kept_until_a_log_changes(tmp_path):
     log = tmp_path / "one" / "run.mcap"
     log.parent.mkdir()
     log.write_bytes(b"1")
-    kept, asked = KeptAnswers(tmp_path), {"runs": ["one"], "runs_folder": str(tmp_path)}
+    kept, asked = DocumentCache(tmp_path), {"runs": ["one"], "runs_folder": str(tmp_path)}
     kept.put(kept.key("compare", asked), {"n": 1})
     assert kept.get(kept.key("compare", asked)) == {"n": 1}
     assert kept.get(kept.key("compare", asked | {"runs": ["one", "one"]})) is None
@@ -18,7 +18,7 @@ def test_a_comparison_is_kept_until_a_log_changes(tmp_path):
 
 
 def test_a_trend_is_its_rows_and_anything_else_is_computed_anew(tmp_path):
-    kept = KeptAnswers(tmp_path)
+    kept = DocumentCache(tmp_path)
     kept.put(kept.key("trend", {"rows": [1], "rig": "a"}), {"n": 1})
     assert kept.get(kept.key("trend", {"rows": [1], "rig": "a"})) == {"n": 1}
     assert kept.get(kept.key("trend", {"rows": [1, 2], "rig": "a"})) is None
@@ -30,7 +30,7 @@ def test_a_trend_is_its_rows_and_anything_else_is_computed_anew(tmp_path):
 def test_a_plan_is_kept_until_the_rig_s_file_changes(tmp_path):
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: a")
-    kept, asked = KeptAnswers(tmp_path), {"rig_file": str(rig), "options": {}, "profile": "1"}
+    kept, asked = DocumentCache(tmp_path), {"rig_file": str(rig), "options": {}, "profile": "1"}
     kept.put(kept.key("plan", asked), {"n": 1})
     assert kept.get(kept.key("plan", asked)) == {"n": 1}
     assert kept.get(kept.key("plan", asked | {"profile": "2"})) is None
@@ -40,7 +40,7 @@ def test_a_plan_is_kept_until_the_rig_s_file_changes(tmp_path):
 
 
 def test_no_more_are_kept_than_memory_is_meant_for(tmp_path):
-    kept = KeptAnswers(tmp_path)
+    kept = DocumentCache(tmp_path)
     for rig in range(MOST + 1):
         kept.put(kept.key("trend", {"rows": [], "rig": str(rig)}), {"n": rig})
     assert kept.get(kept.key("trend", {"rows": [], "rig": "0"})) is None
