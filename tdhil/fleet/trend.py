@@ -52,11 +52,15 @@ def measured(row: FleetRow, quantity: Quantity, time: float = 0.0) -> Measured |
 
 
 def drive_of(row: FleetRow) -> str | None:
-    """Return the drive whose torque scale applies. Without a serial number it is the rig's, by name and profile."""
+    """Return the drive whose torque scale applies. Without a serial number it is the rig's, by name and profile.
+
+    A simulated drive is never the physical one, whatever identity it shows.
+    """
+    simulated = "simulated " if row.simulated else ""
     if row.drive_serial:
-        return f"{row.drive_vendor}:{row.drive_product}:{row.drive_serial}"
+        return f"{simulated}{row.drive_vendor}:{row.drive_product}:{row.drive_serial}"
     named = (row.rig, row.drive_name, row.profile)
-    return None if row.rig is None else "assumed " + "|".join(str(one) for one in named)
+    return None if row.rig is None else f"assumed {simulated}" + "|".join(str(one) for one in named)
 
 
 def series_of(row: FleetRow) -> tuple[str | None, str | None]:
@@ -118,8 +122,6 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None, *, rehearsa
                   key=lambda one: (one[0], one[1].log))
     if len(standing) > len(kept):
         notes.append(f"{counted(len(standing) - len(kept), 'log')} without a date: left out")
-    if len({row.simulated for _, row in kept}) > 1:
-        notes.append("simulated runs and real ones are mixed")
     drives = {drive_of(row) for _, row in kept}
     series = {series_of(row) for _, row in kept}
     if len(series) > 1:         # one series has one bench, one drive and one profile
@@ -161,7 +163,8 @@ def _scope_text(scope: str | None) -> str:
 
 def _drive_text(row: FleetRow) -> str:
     serial = f"serial number {row.drive_serial}" if row.drive_serial else "no serial number"
-    return ", ".join(one for one in (row.drive_name, serial, row.profile) if one)
+    simulated = "SIMULATED" if row.simulated else None
+    return ", ".join(one for one in (row.drive_name, serial, row.profile, simulated) if one)
 
 
 def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dict[str, Any]:

@@ -158,7 +158,8 @@ def test_what_was_left_out_and_assumed_is_said():
     assert "drifts by +" in document["quantities"][0]["text"]
     assert [note.split(":")[0] for note in document["notes"]] == [
         "1 of 24 logs without a result that stands", "1 log without a date",
-        "simulated runs and real ones are mixed", "the drive reports no serial number"]
+        "2 drives or profiles under this name", "the drive reports no serial number"]
+    assert "Left out: 1 result of no serial number, SIMULATED." in document["notes"][2]
     two = trend_document([*found[:12], *(replace(row, drive_serial=9) for row in found[12:])], "R7")
     assert any("2 drives" in note for note in two["notes"])
     assert trend_document(found)["rig"] == "R7"      # the only one
@@ -168,6 +169,19 @@ def test_what_was_left_out_and_assumed_is_said():
         trend_document([FleetRow("other.mcap", "valid")])
     with pytest.raises(UsageError, match="There are: R7"):
         trend_document(found, "R9")
+
+
+@pytest.mark.parametrize("serial", [0, 7])
+def test_simulated_and_real_runs_are_never_one_series(serial):
+    """Same name, drive and profile: four simulated runs of J 104 and four real ones of J 140 are no change of a shaft."""
+    found, _ = rows("none", count=8, serial=serial)
+    mixed = [replace(one, simulated=k < 4, inertia_kg_m2=one.inertia_kg_m2 * (1.0 if k < 4 else 1.35),
+                     inertia_low_kg_m2=one.inertia_low_kg_m2 * (1.0 if k < 4 else 1.35),
+                     inertia_high_kg_m2=one.inertia_high_kg_m2 * (1.0 if k < 4 else 1.35))
+             for k, one in enumerate(found)]
+    document = trend_document(mixed, "R7")
+    assert (document["results"], document["simulated"], document["quantities"][0]["changes"]) == (4, False, [])
+    assert not _differences(mixed[0], mixed[-1])["quantities"][0]["shared_scale"]
 
 
 def test_runs_before_and_after_a_calibration_are_kept_apart():
@@ -198,7 +212,8 @@ def test_dates_of_a_trend_s_picture_can_be_read(tmp_path):
     from tdhil.cli.trend import _draw_trend
 
     found, _ = rows("step 5 %")
-    found[3] = replace(found[3], rehearsed_faults="torque-scale=1.1", simulated=True)
+    found = [replace(one, simulated=True) for one in found]
+    found[3] = replace(found[3], rehearsed_faults="torque-scale=1.1")
     document = trend_document(found, "R7", rehearsals=True)
     assert document["simulated"] and document["rehearsed_faults"] == ["torque-scale=1.1"]
     figure = Figure((7.2, 7.5), layout="constrained")
