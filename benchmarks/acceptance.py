@@ -7,8 +7,9 @@ time each. Rows are kept in ``--out``, so that the study can be stopped and cont
 right in 95 %, false alarms are at most 1 %. A run that ends early is not right: if nothing is changed, it counts as an
 alarm. The exit code is 1 where a rate misses this beyond what chance allows (one side, 95 %).
 
-No quantity of an acceptance is the drive's identity. Another drive shows by its rated torque: all that comes from the
-torque has one factor, above 1 (torque scale) or below (another drive).
+Another drive shows by its rated torque: all that comes from the torque has one factor, above 1 (torque scale) or below
+(another drive); and by its identity. The simulated drive reports its gains and its identity without an error, so these
+are expected only where they are changed.
 """
 
 from __future__ import annotations
@@ -34,18 +35,23 @@ from benchmarks.kept_rows import kept_rows  # noqa: E402
 
 EXPECT = ("inertia=104±15%", "coulomb=60±12", "viscous=8±3", "speed-lag=150ms±100ms", "torque-lag=150ms±100ms",
           "torque-limit=400±10")
+GAINS = ("gain=300±30", "integral-gain=300±30")
 LEAST_NAMED, MOST_ALARMS = 0.95, 0.01
 ENDED = "ended early"
 
 
 @dataclass(frozen=True)
 class Change:
-    """One thing that is not as expected. ``named``: words of the cause; the rest are sections of plant.yaml."""
+    """One thing that is not as expected. ``named``: words of the cause; ``expect``: further expected values.
+
+    The rest are sections of plant.yaml.
+    """
 
     named: str = ""
     plant: dict[str, float] = field(default_factory=dict)
     reporting: dict[str, float] = field(default_factory=dict)
     drive: dict[str, float] = field(default_factory=dict)
+    expect: tuple[str, ...] = ()
 
 
 CHANGES = {
@@ -58,6 +64,9 @@ CHANGES = {
     "viscous friction": Change("viscous friction", plant={"viscous_nm_s_rad": 16.0}),
     "torque filter": Change("lag of the reported torque", reporting={"torque_lag_s": 0.45}),
     "another drive": Change("another rated torque", reporting={"torque_scale": 0.7}),
+    "gain": Change("gain P of the drive", drive={"speed_gain_nm_s_rad": 450.0}, expect=GAINS),
+    "integral gain": Change("integral gain I", drive={"speed_integral_gain_nm_rad": 450.0}, expect=GAINS),
+    "another profile": Change("profile of the drive", expect=("profile=maxon/epos4",)),
 }
 
 
@@ -71,7 +80,7 @@ def run(name: str, seed: int, folder: Path) -> dict[str, Any]:
     }), encoding="utf-8")
     arguments = ["identify", "--simulate", "--seed", str(seed), "--rate", "50", "--json", "--plant", str(plant),
                  "--log", str(folder / "run.mcap")]
-    for text in EXPECT:
+    for text in (*EXPECT, *change.expect):
         arguments += ["--expect", text]
     here = called_here(arguments)
     found = here.document.get("acceptance") or {"verdict": ENDED, "off": []}

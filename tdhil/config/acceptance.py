@@ -15,11 +15,16 @@ from tdhil.errors import MessageCode, UsageError
 
 @dataclass(frozen=True)
 class AcceptedQuantity:
-    """Quantity that can be accepted: its unit, its label, and its place in the result document."""
+    """Quantity that can be accepted: its unit, its label, and its place in the result document.
 
-    unit: Unit
+    ``unit``: None for an identity, a text that must be the same. ``reported``: place of the value that the drive itself
+    reports, for a result that does not measure it.
+    """
+
+    unit: Unit | None
     label: str
     at: tuple[str, ...]
+    reported: tuple[str, ...] = ()
 
 
 ACCEPTED_QUANTITIES: Final[Mapping[str, AcceptedQuantity]] = MappingProxyType({
@@ -29,10 +34,14 @@ ACCEPTED_QUANTITIES: Final[Mapping[str, AcceptedQuantity]] = MappingProxyType({
     "coulomb": AcceptedQuantity(TORQUE, "Coulomb friction T_c", ("coulomb_nm",)),
     "speed-lag": AcceptedQuantity(TIME, "lag of the reported speed", ("speed_lag_s",)),
     "torque-lag": AcceptedQuantity(TIME, "lag of the reported torque", ("torque_lag_s",)),
-    "gain": AcceptedQuantity(FRICTION, "gain P of the drive's speed loop", ("impedance", "gain_nm_s_rad")),
+    "gain": AcceptedQuantity(FRICTION, "gain P of the drive's speed loop", ("impedance", "gain_nm_s_rad"),
+                             ("speed_loop_present", "gain_nm_s_rad")),
     "integral-gain": AcceptedQuantity(STIFFNESS, "integral gain I of the drive's speed loop",
-                                      ("impedance", "integral_nm_rad")),
+                                      ("impedance", "integral_nm_rad"), ("speed_loop_present", "integral_nm_rad")),
     "torque-limit": AcceptedQuantity(TORQUE, "torque limit of the run", ("torque_limit_nm",)),
+    "drive-serial": AcceptedQuantity(None, "serial number of the drive", ("drive", "serial")),
+    "drive-name": AcceptedQuantity(None, "name of the drive", ("drive", "name")),
+    "profile": AcceptedQuantity(None, "profile of the drive", ("profile", "name")),
 })
 """Quantities by the names that an operator writes."""
 _PARTS: Final = re.compile(r"\s*(?P<value>[^±]+?)\s*(?:±|\+/?-)\s*(?P<tolerance>.+?)\s*")
@@ -42,11 +51,12 @@ _FLAG: Final = OPTION["expect"].flag
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected value of one quantity, and its tolerance on either side, in SI."""
+    """Expected value of one quantity, and its tolerance on either side, in SI. ``text``: an expected identity."""
 
     name: str
     value: float
     tolerance: float
+    text: str = ""
 
     @staticmethod
     def of(name: str, text: str) -> Expectation:
@@ -54,6 +64,10 @@ class Expectation:
         quantity = ACCEPTED_QUANTITIES.get(name)
         if quantity is None:
             raise ValueError(f"no quantity is called {name!r:.40}: {', '.join(ACCEPTED_QUANTITIES)}")
+        if quantity.unit is None:
+            if not text.strip():
+                raise ValueError(f"the expected {quantity.label} is empty")
+            return Expectation(name, 0.0, 0.0, text.strip())
         found = _PARTS.fullmatch(text)
         if found is None:
             raise ValueError(f"{text!r:.40} is not a value with its tolerance, such as {_EXAMPLE}")
@@ -86,7 +100,7 @@ def expectations_in(run: Mapping[str, Any]) -> tuple[Expectation, ...]:
     """Return the expectations in the configuration of a log. The content of a log is not trusted."""
     rows = run.get("acceptance")
     return tuple(
-        Expectation(one["name"], float(one["value"]), float(one["tolerance"]))
+        Expectation(one["name"], float(one["value"]), float(one["tolerance"]), str(one.get("text") or "")[:80])
         for one in (rows if isinstance(rows, list | tuple) else ())
         if isinstance(one, Mapping) and one.get("name") in ACCEPTED_QUANTITIES
         and all(isinstance(one.get(key), int | float) for key in ("value", "tolerance"))

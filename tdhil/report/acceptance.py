@@ -40,9 +40,9 @@ class Accepted:
     name: str
     label: str
     unit: str
-    expected: float
+    expected: float | str
     tolerance: float
-    value: float | None
+    value: float | str | None
     low: float | None
     high: float | None
     verdict: AcceptanceVerdict
@@ -91,7 +91,18 @@ def signature_rows(acceptance: Part) -> list[tuple[str, str]]:
 
 def _judged(expected: Expectation, document: Part) -> Accepted:
     quantity = ACCEPTED_QUANTITIES[expected.name]
-    value, low, high = _identified(expected.name, quantity.at, document)
+    if quantity.unit is None:
+        found = _at(quantity.at, document)
+        verdict = AcceptanceVerdict.CANNOT_TELL if found is None else (
+            AcceptanceVerdict.PASS if str(found).casefold() == expected.text.casefold() else AcceptanceVerdict.FAIL)
+        seen = "not reported" if found is None else f"found {found}"
+        return Accepted(expected.name, quantity.label, "", expected.text, 0.0, None if found is None else str(found),
+                        None, None, verdict, f"{verdict}: expected {expected.text}, {seen}")
+    value, low, high = _identified(expected.name, _at(quantity.at, document), document)
+    how = "identified"
+    if value is None and quantity.reported:
+        value, low, high = _identified(expected.name, _at(quantity.reported, document), document)
+        how = "reported by the drive"
     least, most = expected.value - expected.tolerance, expected.value + expected.tolerance
     wanted = f"expected {expected.value:.5g} ± {expected.tolerance:.3g} {quantity.unit.symbol}"
     if value is None or low is None or high is None:
@@ -111,23 +122,28 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
                 other = f", which is {scope_text(scope)}, not {scope_text(own)}{advice}"
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
         span = "" if low == high else f" ({printed_interval(low, high, 5)})"     # a setting of the run has none
-        seen = f"identified {value:.5g}{span}{other}"
+        seen = f"{how} {value:.5g}{span}{other}"
     return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
                     value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
 
 
-def _identified(name: str, at: Iterable[str], document: Part) -> tuple[float | None, float | None, float | None]:
+def _at(place: Iterable[str], document: Part) -> Any:
+    """Return what stands at this place of the document; None for nothing."""
+    part: Any = document
+    for key in place:
+        part = part.get(key) if isinstance(part, Mapping) else None
+    return part
+
+
+def _identified(name: str, part: Any, document: Part) -> tuple[float | None, float | None, float | None]:
     """Return value and interval. Those of J and friction include the torque scale; a read value, a limit, is exact."""
-    part: Any
-    part, scale, calibration = document, 1.0, document.get("torque_calibration")
+    scale, calibration = 1.0, document.get("torque_calibration")
     if name in _SETTINGS and isinstance(calibration, Mapping):
         # The torque limit is a setting of the drive or of rig.yaml, in the N·m of the drive. If a calibration was
         # applied, the document has it in calibrated N·m, the scale in which saturation is judged. A correct setting
         # must not fail by κ. The gains need no factor: no calibration is applied to a run that measures the drive's
         # impedance.
         scale = 1.0 / float(calibration["factor"])
-    for key in at:
-        part = part.get(key) if isinstance(part, Mapping) else None
     if isinstance(part, int | float) and not isinstance(part, bool):
         return scale * part, scale * part, scale * part
     if not isinstance(part, Mapping):
@@ -153,6 +169,9 @@ def _causes(rows: Sequence[Accepted]) -> Iterable[str]:
                    "another torque scale, another rated torque, or another drive")
             failed = [one for one in failed if one.name not in _WITH_TORQUE]
     for one in failed:
+        if isinstance(one.expected, str) or isinstance(one.value, str):
+            yield f"the {one.label} is {one.value}, not {one.expected}{_HINTS[one.name]}"
+            continue
         assert one.value is not None
         ratio = f"{one.value / one.expected:.3g} times the expected value" if one.expected else f"{one.value:.3g}"
         yield f"the {one.label} is {ratio}{_HINTS.get(one.name, '')}"
@@ -166,12 +185,16 @@ _HINTS: Final = {
     "torque-lag": ": the torque filter of the drive has another setting",
     "gain": ": the speed controller of the drive has another gain",
     "integral-gain": ": the speed controller of the drive has another integral time",
+    "drive-serial": ": another drive",
+    "drive-name": ": another drive",
+    "profile": ": another profile was chosen",
     "torque-limit": ": the drive or rig.yaml limits the torque elsewhere",
 }
 
 
 def _ratio(one: Accepted) -> tuple[float, float]:
     """Return identified over expected, and the half-width of its interval."""
-    if not one.expected or one.value is None or one.low is None or one.high is None:
+    if isinstance(one.expected, str) or isinstance(one.value, str) or not one.expected or one.value is None or (
+            one.low is None or one.high is None):
         return 0.0, float("inf")
     return one.value / one.expected, 0.5 * (one.high - one.low) / abs(one.expected)

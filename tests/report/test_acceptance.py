@@ -110,6 +110,38 @@ def test_one_factor_in_all_that_has_a_torque_is_one_cause():
     assert "1.3 times" in told and "torque scale" in told
 
 
+PRESENT = {"gain_nm_s_rad": 250.0, "integral_nm_rad": 125.0, "filter_s": 0.02, "settings": {}}
+
+
+def test_the_gains_that_the_drive_reports_are_judged_if_none_was_measured():
+    """`--impedance` is not open to the browser: there, the gains read in preflight are what can be judged."""
+    expected = {"gain": (250.0, 5.0), "integral-gain": (200.0, 10.0)}
+    found = judged({**document(), "speed_loop_present": PRESENT}, expected)
+    assert [one["verdict"] for one in found["quantities"]] == ["pass", "fail"]
+    assert found["quantities"][0]["text"].endswith("reported by the drive 250")
+    (told,) = found["off"]
+    assert "integral gain I" in told and "another integral time" in told
+    measured = {"gain_nm_s_rad": part(300.0, 0.01), "integral_nm_rad": None}
+    found = judged({**document(), "impedance": measured, "speed_loop_present": PRESENT}, expected)
+    assert [one["verdict"] for one in found["quantities"]] == ["fail", "fail"]
+    assert "identified 300" in found["quantities"][0]["text"]
+
+
+def test_another_drive_is_named_by_its_identity():
+    drive = {"drive": {"name": "EPOS4", "serial": 17}, "profile": {"name": "maxon/epos4"}}
+    expected = [Expectation.of("drive-serial", "17"), Expectation.of("drive-name", "epos4"),
+                Expectation.of("profile", " maxon/epos4 ")]
+    assert acceptance_of(expected, {**document(), **drive})["verdict"] == "pass"
+    found = acceptance_of(expected, {**document(), **drive, "drive": {"name": "EPOS4", "serial": 18}})
+    assert (found["verdict"], found["off"]) == (
+        "fail", ["the serial number of the drive is 18, not 17: another drive"])
+    assert acceptance_of(expected, document())["verdict"] == "cannot tell"
+    stored = [{"name": one.name, "value": one.value, "tolerance": one.tolerance, "text": one.text} for one in expected]
+    assert expectations_in({"acceptance": stored}) == tuple(expected)
+    with pytest.raises(ValueError, match="is empty"):
+        Expectation.of("profile", " ")
+
+
 def test_the_interval_decides_and_not_the_value():
     assert judged(document(inertia=108.0))["verdict"] == "cannot tell"          # reaches beyond the tolerance
     assert judged(document(inertia=113.0))["verdict"] == "fail"
