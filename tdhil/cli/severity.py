@@ -55,6 +55,7 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.report import (
         PlainConsole,
         print_severity,
+        rehearsed_faults,
         severity_document,
         severity_report,
     )
@@ -71,7 +72,8 @@ def run(namespace: argparse.Namespace) -> int:
     found: list[tuple[Severity, str]] = []
     noises: list[BitNoiseEstimate | str] = []
     warnings: list[str] = []
-    simulated = False
+    faults = [str(one) for one in result.get("rehearsed_faults") or ()]      # those of the run that gave J
+    simulated = bool(faults)
     configurations = []
     for path in paths:
         require_file(path)
@@ -84,9 +86,11 @@ def run(namespace: argparse.Namespace) -> int:
             noises.append(bit_noise_in(record, string, inertia))
         except SeverityRefused as refused:     # a text states why the record does not determine the bit noise
             noises.append(str(refused))
-        simulated = recorded.recording.simulated
+        simulated |= recorded.recording.simulated
+        faults += rehearsed_faults(recorded.configuration)
         configurations.append(recorded.configuration)
     document = severity_document(found, noises, string, inertia, simulated=simulated,
+                                 rehearsed_faults=faults,
                                  warnings=tuple(dict.fromkeys(warnings)))
     if namespace.json:
         print_json(document)

@@ -597,4 +597,5 @@ def _tuned_for(
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
                     None if profile is None else profile.name, ratio, namespace.loop, sources.lags, sources.present,
-                    settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED})
+                    settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED},
+                    tuple(result.get("rehearsed_faults") or ()))

@@ -260,4 +260,5 @@ def _tuned_for(
     return LoopTunedFor(str(namespace.result), bool(result.get("simulated")), str(result.get("model")),
                         None if profile is None else profile.name, float(result["gear_ratio"]), settings=settings,
                         notch_named=parameters is not None and bool(parameters.notch), warnings=tuple(warnings),
-                        reported_speed_lag_s=_range_or_none(result.get("speed_lag_s")))
+                        reported_speed_lag_s=_range_or_none(result.get("speed_lag_s")),
+                        rehearsed_faults=tuple(result.get("rehearsed_faults") or ()))

@@ -17,7 +17,7 @@ from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table
 from tdhil.report.card import minutes
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import SIMULATED
+from tdhil.report.document import marks
 from tdhil.report.figure_words import meanings_section, print_meanings
 from tdhil.report.plots import DARK, OURS, QUIET, envelope
 from tdhil.soft_torque import AT_RISK_INDEX, RPM, STICK_SLIP_INDEX, BitNoiseEstimate, DrillString, Interval, Severity
@@ -39,7 +39,7 @@ SHOWN_PERIODS = 12.0
 
 def severity_document(
     found: Sequence[tuple[Severity, str]], noises: Sequence[BitNoiseEstimate | str], string: DrillString,
-    inertia: Interval, *, simulated: bool, warnings: tuple[str, ...],
+    inertia: Interval, *, simulated: bool, rehearsed_faults: Sequence[str] = (), warnings: tuple[str, ...],
 ) -> dict[str, Any]:
     """Return plain data for `json.dumps`, at the main shaft; one record, or two, the second of which is later.
 
@@ -48,6 +48,7 @@ def severity_document(
     records = [_record(one, name) | _noise(noise) for (one, name), noise in zip(found, noises, strict=True)]
     return {
         "kind": "severity", "records": records, "sentence": _sentence(records), "simulated": simulated,
+        "rehearsed_faults": list(rehearsed_faults),
         "string": {"name": string.name, "impedance_nm_s_rad": string.impedance_nm_s_rad, "echo_s": string.echo_s},
         "inertia_kg_m2": asdict(inertia), "warnings": list(warnings), "tdhil": __version__,
     }
@@ -107,7 +108,7 @@ def print_severity(document: Part, console: PlainConsole) -> None:
     records = document["records"]
     console.print(Words(document["sentence"], style=_STYLES[records[-1]["level"]]))
     console.print()
-    simulated = f" · {SIMULATED}" if document["simulated"] else ""
+    simulated = f" · {found}" if (found := marks(document)) else ""
     console.print(Words(f"torsional severity, {document['string']['name'] or 'drill string'}{simulated}", style="bold"))
     if len(records) == 1:
         console.print(names_and_texts([(name, cells[0]) for name, cells in _rows(records)]))
@@ -208,7 +209,7 @@ def severity_report(document: Part, found: Sequence[Severity]) -> Report:
     expected = "" if check is None or check["expected"] is None else f"Reflection of the top drive: {check['verdict']}."
     return Report(
         title="Torsional severity", subtitle=document["string"]["name"] or "drill string",
-        simulated=f"{SIMULATED}: the record is that of a simulated rig" if document["simulated"] else "",
+        simulated=f"{marks(document)}: the record is that of a simulated rig" if document["simulated"] else "",
         answer=AnswerBox(_COLOURS[last["level"]], last["level"], (expected,) if expected else (),
                          f"severity index {last['severity_index']['value']:.2f}", document["sentence"], ""),
         warnings=tuple(document["warnings"]),

@@ -18,7 +18,7 @@ from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
-from tdhil.report.document import SIMULATED, only_finite
+from tdhil.report.document import marks, only_finite
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import plain_ticks
@@ -85,6 +85,8 @@ class LoopTunedFor:
     warnings: tuple[str, ...] = ()
     reported_speed_lag_s: Range | None = None
     """Lag of the reported speed, for tune verify; None: unknown."""
+    rehearsed_faults: tuple[str, ...] = ()
+    """Faults that were scripted in the run."""
 
 
 def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:
@@ -97,6 +99,7 @@ def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: Lo
         "tuned_for": {
             "source": tuned_for.source, "simulated": tuned_for.simulated, "model": tuned_for.model,
             "profile": tuned_for.profile, "gear_ratio": tuned_for.gear_ratio, "present_from": tuned_for.present_from,
+            "rehearsed_faults": list(tuned_for.rehearsed_faults),
         },
         "plant": {name: None if part is None else [asdict(one) for one in part] if isinstance(part, tuple)
                   else asdict(part) for name, part in vars(plant).items()} | {
@@ -238,7 +241,7 @@ def _step(row: LoopRow) -> dict[str, list[float]]:
 
 def print_loop_tuning(document: Part, console: PlainConsole) -> None:
     """Print gains, margins, step response and their conditions, in 80 columns."""
-    simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
+    simulated = f" · {found}" if (found := marks(document["tuned_for"])) else ""
     console.print(Words(document["sentence"], style="bold green"))
     console.print()
     console.print(Words(f"speed loop of the drive{simulated}", style="bold"))
@@ -447,7 +450,7 @@ def loop_report(document: Part) -> Report:
     return Report(
         title="Speed loop of the drive",
         subtitle=f"tuned for a bandwidth of {tuned['bandwidth_hz']['value']:.3g} Hz",
-        simulated=f"{SIMULATED}: the result is that of a simulated rig" if tuned_for["simulated"] else "",
+        simulated=f"{marks(tuned_for)}: the result is that of a simulated rig" if tuned_for["simulated"] else "",
         answer=AnswerBox(
             "green", f"P = {gain_words(tuned['gain_nm_s_rad'])} N·m·s/rad, "
             f"I = {gain_words(tuned['integral_nm_rad'])} N·m/rad", ("at the motor shaft",),

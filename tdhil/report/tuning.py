@@ -14,7 +14,7 @@ from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
-from tdhil.report.document import SIMULATED
+from tdhil.report.document import marks
 from tdhil.report.figure_words import meanings_section, print_meanings, words_of
 from tdhil.report.operator_map import map_figures, map_section, print_map
 from tdhil.report.schedule import (
@@ -89,6 +89,8 @@ class TunedFor:
     warnings: tuple[str, ...] = ()
     identified: Mapping[str, Any] = field(default_factory=dict)
     """Values of the result at the motor shaft that a virtual string on the same rig needs."""
+    rehearsed_faults: tuple[str, ...] = ()
+    """Faults that were scripted in the run."""
 
 
 def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
@@ -124,6 +126,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
         "tuned_for": {
             "source": tuned_for.source, "simulated": tuned_for.simulated, "profile": tuned_for.profile,
             "loop": tuned_for.loop, "gear_ratio": ratio, "present_from": tuned_for.present_from,
+            "rehearsed_faults": list(tuned_for.rehearsed_faults),
         },
         "identified": dict(tuned_for.identified),
         "main_shaft": {
@@ -300,7 +303,7 @@ def _number(value: float | None) -> float | None:
 
 def print_tuning(document: Part, console: PlainConsole) -> None:
     """Print gains, their effects and their conditions, in 80 columns."""
-    simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
+    simulated = f" · {found}" if (found := marks(document["tuned_for"])) else ""
     advice = document["advice"]
     console.print(Words(advice["sentence"], style="bold yellow" if advice["kind"] is None else "bold green"))
     for one in document["controllers"]:
@@ -523,7 +526,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     return Report(
         title="Speed controller and drill string",
         subtitle=_string_words(document),
-        simulated=f"{SIMULATED}: J is that of a simulated rig" if simulated else "",
+        simulated=f"{marks(document['tuned_for'])}: J is that of a simulated rig" if simulated else "",
         answer=_answer(best, document),
         warnings=tuple(document["warnings"]),
         sections=tuple(sections),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.errors import UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session.run_record import RunRecord
-from tdhil.session.stored_calibration import drive_identity, drive_settings
+from tdhil.session.stored_calibration import drive_identity, drive_settings, refuse_rehearsal
 
 if TYPE_CHECKING:
     from tdhil.calibration import KnownPipe
@@ -39,6 +39,7 @@ def find_by_reference(
     from tdhil.report import reference_document
 
     record.require_motion()
+    refuse_rehearsal(record)
     recording = record.recording
     sensor = read_reference(trace, parse_columns(columns or (), TIME_AND_TORQUE, REFERENCE_FLAG))
     ratio = recording.gear_ratio if at == "main" else 1.0
@@ -136,6 +137,7 @@ def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict
     from tdhil.soft_torque import StringFile
 
     record.require_motion()
+    refuse_rehearsal(record)
     recording = record.recording
     try:
         known = known_pipe_of(load_model(path, StringFile), recording.gear_ratio)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.errors import MessageCode, UsageError
 from tdhil.session.run_record import RunRecord
-from tdhil.session.stored_calibration import load_calibration, other_drive, save_calibration
+from tdhil.session.stored_calibration import load_calibration, other_drive, refuse_rehearsal, save_calibration
 
 if TYPE_CHECKING:
     from tdhil.calibration import CountedTurns, SpeedCalibration
@@ -54,6 +54,7 @@ def speed_by_position(record: RunRecord, wanted: float, confidence: float) -> Sp
     from tdhil.recording import before_abort
 
     record.require_motion()
+    refuse_rehearsal(record)
     if record.recording.position_rad is None:
         raise UsageError("holds no position of the drive", where=record.log,
                          next_step="Count turns of the shaft: --turns 100 --seconds 312.4 --speed 2.0")
@@ -81,6 +82,7 @@ def speed_by_turns(
         speed, bound = count.speed_rad_s, 0.0
         speed_sd = SPEED_REL_SD * abs(speed) if count.speed_sd_rad_s is None else count.speed_sd_rad_s
     else:
+        refuse_rehearsal(record)
         if count.start_s is None or count.end_s is None or not count.start_s < count.end_s:
             raise UsageError("needs the times of the log between which the turns were counted", where=record.log,
                              next_step="Such as: tdhil calibrate speed run.mcap --turns 100 --from 20 --to 332.4")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tdhil.calibration import StoredCalibration
     from tdhil.config import Rig
     from tdhil.recording import Recording
+    from tdhil.session.run_record import RunRecord
 
 KEPT: Final = "torque_calibration"
 """Key of the calibration in the log's configuration."""
@@ -53,6 +54,15 @@ def save_calibration(document: Mapping[str, Any], path: Path) -> None:
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--save {path}",
                          entry=MessageCode.FILE_NOT_WRITABLE) from error
+
+
+def refuse_rehearsal(record: RunRecord) -> None:
+    """Raise UsageError for a rehearsal: a scripted fault, such as another torque scale, is no property of the drive."""
+    from tdhil.report import rehearsed_faults
+
+    if faults := rehearsed_faults(record.configuration):
+        raise UsageError(f"is a rehearsal of faults ({', '.join(faults)}): no drive is calibrated by it",
+                         where=record.log, next_step="Calibrate with runs without --fault")
 
 
 def calibration_of_rig(rig: Rig | None) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from tdhil.errors import UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session.conclusion import conclude
 from tdhil.session.run_record import RunRecord
-from tdhil.session.stored_calibration import drive_identity, drive_settings, without_calibration
+from tdhil.session.stored_calibration import drive_identity, drive_settings, refuse_rehearsal, without_calibration
 
 if TYPE_CHECKING:
     from tdhil.calibration import RunPlan, TorqueCalibration, TorquePairs
@@ -156,6 +156,7 @@ def _require_comparable(runs: Sequence[CalibrationRun]) -> None:
         raise UsageError("all runs have the same body", next_step="Give the inertia of the body: --added 55")
     seen: dict[str, str] = {}
     for run in runs:
+        refuse_rehearsal(run.record)
         digest = sha256_of(Path(run.record.log))
         if digest in seen:
             raise UsageError(f"is the same recording as {seen[digest]}", where=run.record.log,

@@ -49,6 +49,12 @@ def test_one_record(bench, capsys):
         5600.0 / 296.5 * np.sin(2.0 * np.pi / 8.16 * 0.944) * 30.0 / np.pi, rel=0.05)
 
 
+def test_j_of_a_rehearsal_marks_what_is_computed_from_it(bench, capsys):
+    rehearsed = result(torque_lag_s=None) | {"simulated": True, "rehearsed_faults": ["torque-scale=1.1"]}
+    (bench / "result.json").write_text(json.dumps(rehearsed), encoding="utf-8")
+    assert "· SIMULATED · FAULT REHEARSAL" in " ".join(ran(bench, capsys)[1].split())
+
+
 @pytest.mark.heavy
 def test_two_records_side_by_side_in_80_columns_and_as_a_page(bench, capsys):
     code, out, err = ran(bench, capsys, "--against", str(bench / "after.csv"), "--report", str(bench / "page.html"))

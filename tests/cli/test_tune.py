@@ -78,10 +78,11 @@ def test_gains_stand_at_main_shaft_and_motor_and_in_the_drives_parameters(tuned)
 
 @pytest.mark.heavy
 def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
-    code, text, _ = tuned("--inner-lags", "20ms", "10ms", "3ms", "--profile", "abb/acs880-enhanced", as_json=False)
+    code, text, _ = tuned("--inner-lags", "20ms", "10ms", "3ms", "--profile", "abb/acs880-enhanced", as_json=False,
+                          rehearsed_faults=["torque-scale=1.1"])
     assert code == 0
     words = " ".join(text.split())
-    assert "SIMULATED" in words
+    assert "SIMULATED · FAULT REHEARSAL" in words
     assert "20 + 10 + 3 ms, as stated" in words
     assert "static 5000 N·m" in words
     assert "broadband refused" in words

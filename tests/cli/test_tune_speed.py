@@ -80,6 +80,11 @@ def test_the_terminal_fits_80_columns_and_says_what_to_type(tuned):
     assert max(map(len, text.splitlines())) <= 80
 
 
+def test_a_rehearsal_is_marked(tuned):
+    code, text, _ = tuned(simulated=True, rehearsed_faults=["torque-scale=1.1"], as_json=False)
+    assert code == 0 and "speed loop of the drive · SIMULATED · FAULT REHEARSAL" in " ".join(text.split())
+
+
 def test_measured_lags_and_present_gains_come_from_the_impedance(tuned, tmp_path):
     path = tmp_path / "z.json"
     path.write_text(json.dumps(result(impedance=impedance())), encoding="utf-8")
