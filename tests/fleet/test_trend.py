@@ -173,7 +173,7 @@ def test_what_was_left_out_and_assumed_is_said():
 
 @pytest.mark.parametrize("serial", [0, 7])
 def test_simulated_and_real_runs_are_never_one_series(serial):
-    """Same name, drive and profile: four simulated runs of J 104 and four real ones of J 140 are no change of a shaft."""
+    """Same name, drive and profile: four simulated runs of J 104 and four real ones of J 140 are no change."""
     found, _ = rows("none", count=8, serial=serial)
     mixed = [replace(one, simulated=k < 4, inertia_kg_m2=one.inertia_kg_m2 * (1.0 if k < 4 else 1.35),
                      inertia_low_kg_m2=one.inertia_low_kg_m2 * (1.0 if k < 4 else 1.35),

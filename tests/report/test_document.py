@@ -4,6 +4,10 @@ import json
 
 import pytest
 
+from tdhil.fleet import FleetRow
+from tdhil.fleet.trend import _settings
+from tdhil.report.blocks import _run_rows
+from tdhil.report.calibration_page import calibrated_item
 from tdhil.report.document import result_document
 from tests.report.findings import bare, full, open_sided, recording
 
@@ -12,6 +16,17 @@ from tests.report.findings import bare, full, open_sided, recording
 def test_it_is_json(make):
     document = result_document(make(), recording(), {}, "run.mcap")
     assert json.loads(json.dumps(document, allow_nan=False)) == document
+
+
+def test_a_revision_is_written_in_hexadecimal_as_in_the_manual_of_the_drive():
+    """65536 is 10000h: in the report of a run, on the page of a calibration, and in a comparison."""
+    drive = {"vendor": 0x2A, "product": 402, "revision": 65536, "serial": 7, "name": "EPOS4"}
+    document = result_document(bare(), recording(), {"identity": drive}, "run.mcap")
+    assert dict(_run_rows(document, recording()))["identity"] == "vendor 2Ah, product 192h, revision 10000h"
+    (identity,) = calibrated_item({"drive": drive, "settings": {}}).blocks
+    assert ("revision", "10000h") in identity.rows
+    row = FleetRow("run.mcap", "valid", drive_revision=65536)
+    assert _settings(row, document, recording(), {})["revision"] == "10000h"
 
 
 def test_every_part_is_in_it():
