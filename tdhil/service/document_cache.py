@@ -14,7 +14,7 @@ MOST: Final = 64
 
 
 class DocumentCache:
-    """Cache of the latest documents of `plan`, `trend` and `compare`. Each depends on its request and files only."""
+    """Cache of the latest plans, trends, comparisons and calibrations. Each depends on its request and files only."""
 
     def __init__(self, runs: Path) -> None:
         self._runs = runs
@@ -22,9 +22,10 @@ class DocumentCache:
 
     def key(self, what: str, asked: Mapping[str, Any]) -> str | None:
         """Return the cache key of a request, its logs and its rig file; None if its document is not cached."""
-        if what not in ("trend", "compare", "plan"):
+        if what not in ("trend", "compare", "plan", "calibrate"):
             return None
-        runs: Sequence[str] = asked["runs"] if what == "compare" else ()
+        runs: Sequence[str] = asked["runs"] if what == "compare" else [
+            asked[name] for name in ("without", "with_body") if name in asked]
         try:
             files = [hashlib.sha256(Path(asked["rig_file"]).read_bytes()).hexdigest()] if what == "plan" else []
             logs = [(one.st_size, one.st_mtime_ns) for one in ((self._runs / run / "run.mcap").stat() for run in runs)]

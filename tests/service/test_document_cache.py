@@ -17,6 +17,18 @@ def test_a_comparison_is_kept_until_a_log_changes(tmp_path):
     assert kept.get(kept.key("compare", asked)) is None
 
 
+def test_a_calibration_is_kept_until_one_of_its_logs_changes(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.mcap").write_bytes(b"1")
+    kept, asked = KeptAnswers(tmp_path), {"without": "one", "with_body": "two", "added_kg_m2": 55.0}
+    kept.put(kept.key("calibrate", asked), {"n": 1})
+    assert kept.get(kept.key("calibrate", asked)) == {"n": 1}
+    assert kept.get(kept.key("calibrate", asked | {"added_kg_m2": 50.0})) is None
+    (tmp_path / "two" / "run.mcap").write_bytes(b"12")
+    assert kept.get(kept.key("calibrate", asked)) is None
+
+
 def test_a_trend_is_its_rows_and_anything_else_is_computed_anew(tmp_path):
     kept = DocumentCache(tmp_path)
     kept.put(kept.key("trend", {"rows": [1], "rig": "a"}), {"n": 1})
