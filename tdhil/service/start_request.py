@@ -34,7 +34,7 @@ from tdhil.config import (
     resolve,
     wrong_values,
 )
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import MessageCode, TdhilError, UsageError
 from tdhil.service.run_state import NotAllowed, NotThere
 from tdhil.session import address_of, connection_of
 
@@ -369,6 +369,17 @@ def require_unwatched(rig: RigFile) -> None:
         where = (rig.rig and rig.rig.source("service.motion")) or rig.path.name
         raise NotAllowed("this rig moves only while a logged-in user watches it (service.motion: watched)",
                          where=where, next_step="Log in. On a service without accounts set motion: attended")
+
+
+def require_faults(texts: Sequence[str], drive: str) -> None:
+    """Refuse faults that the simulator of this bus can't script. Raises ValuesWrong."""
+    from tdhil.buses import bus_named
+
+    try:
+        if texts:
+            bus_named(drive).parse_faults(texts)
+    except TdhilError as error:
+        raise ValuesWrong([("fault", f"{error.what}. {error.next_step}")]) from None
 
 
 def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None = None) -> RunRequest:

@@ -53,6 +53,7 @@ from tdhil.service.start_request import (
     edited,
     is_as_it_was,
     options_of,
+    require_faults,
     require_motion,
     require_new_rig,
 )
@@ -240,7 +241,8 @@ class Supervisor:
         options = options_of(asked)
         rig = self.rigs.get(rig_id)
         require_motion(rig)
-        rig.way(options)               # contradictions between options are reported now, not by the run
+        _, connection = rig.way(options)       # contradictions and wrong faults are reported now, not by the run
+        require_faults(options.get("fault") or (), connection.drive)
         with self._asking:
             if key is not None and (before := self.store.request_with_key(rig_id, key, who)) is not None:
                 if dict(before.options) != options:

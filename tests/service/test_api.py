@@ -274,6 +274,8 @@ def test_health_and_metrics(client, call, service):
 
 
 def test_rehearsals_are_counted_for_themselves_and_marked(client, call, service):
+    (wrong,) = call("POST", "/rigs/a/runs", 422, json={"fault": ["torque-scale=abc"]})["fields"]
+    assert wrong["option"] == "fault" and wrong["message"].startswith("'abc' is no value of torque-scale. It takes ")
     asked = {"note": "hold", "fault": ["sto@hold+2s"]}
     run = call("POST", "/rigs/a/runs", 201, json=asked)["id"]
     service.wait(run, "moving")
