@@ -25,7 +25,7 @@ from tdhil.service.schemas import (
     StoppedView,
     TrendView,
 )
-from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
+from tdhil.service.start_request import EDITABLE, RigFile, ValuesWrong, options_of, require_motion, require_unwatched
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -182,15 +182,17 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
     """Return the torque calibration from two ended runs of the rig."""
     which = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     sd = body.added_sd_kg_m2
-    if not 0.0 < body.added_kg_m2 <= LARGEST_KG_M2:
-        raise UsageError(f"{body.added_kg_m2:g}: must be a positive number of kg·m²", where="added_kg_m2",
-                         entry=MessageCode.REQUEST_WRONG)
-    if sd is not None and not 0.0 <= sd <= LARGEST_KG_M2:
-        raise UsageError(f"{sd:g}: must be a number of kg·m², not negative", where="added_sd_kg_m2",
-                         entry=MessageCode.REQUEST_WRONG)
+    added_wrong = not 0.0 < body.added_kg_m2 <= LARGEST_KG_M2
+    sd_wrong = sd is not None and not 0.0 <= sd <= LARGEST_KG_M2
+    if added_wrong or sd_wrong:
+        raise ValuesWrong([one for wrong, one in (
+            (added_wrong, ("added_kg_m2", f"{body.added_kg_m2}: must be a positive number of kg·m²")),
+            (sd_wrong, ("added_sd_kg_m2", f"{sd}: must be a number of kg·m², not negative"))) if wrong])
 
     def check() -> None:
-        for run in (body.without, body.with_body):
+        for name, run in (("without", body.without), ("with_body", body.with_body)):
+            if site.store.rehearsed(run):
+                raise ValuesWrong([(name, "is a rehearsal of faults: no drive is calibrated by it")])
             if site.store.request(run).rig != which.id:
                 raise UsageError(f"is not a run of rig {which.id}", where=f"run {run}",
                                  next_step="Calibrate each drive by its own two runs", entry=MessageCode.REQUEST_WRONG)

@@ -38,7 +38,7 @@ from tdhil.service.schemas import (
     SignOffBody,
     plain,
 )
-from tdhil.service.start_request import options_of
+from tdhil.service.start_request import ValuesWrong, options_of
 from tdhil.service.store import write_json
 from tdhil.version import __version__
 
@@ -183,8 +183,7 @@ async def sign_off(site: Site, request: Request, body: SignOffBody) -> RunView:
     """Sign off a stop that was not confirmed."""
     which, who = request.path_params["run"], principal(request).name
     if not body.note.strip() or len(body.note) > 500:
-        raise UsageError("must be 1 to 500 characters: state what you saw", where="note",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise ValuesWrong([("note", "must be 1 to 500 characters: state what you saw")])
     await off(lambda: site.supervisor.sign_off(which, who, body.note))
     return await off(lambda: site.run_view(which))
 

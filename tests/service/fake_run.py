@@ -1,10 +1,10 @@
 """A run's process without a drive: the same files, socket and lock, and what the request's note says happens.
 
-``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, and is not seen at rest then) | ``ask`` (wants
-the code first; where its rig is watched, it then moves until it is stopped, or watched no more) | ``patient`` (the
-same, whose lease counts the time from when its page says that it goes: a test of it has all the time that it takes) |
-``frozen`` (hears no stop) | ``identify`` (its motion is over, and it computes until it is stopped) | ``die``
-(killed while it moves)
+``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, and is not seen at rest then) | ``brake`` (the
+same, and brakes until its folder has a file ``rest``) | ``ask`` (wants the code first; where its rig is watched, it
+then moves until it is stopped, or watched no more) | ``patient`` (the same, whose lease counts the time from when its
+page says that it goes: a test of it has all the time that it takes) | ``frozen`` (hears no stop) | ``identify`` (its
+motion is over, and it computes until it is stopped) | ``die`` (killed while it moves)
 """
 
 from __future__ import annotations
@@ -93,8 +93,12 @@ def main(folder: Path) -> None:
         if what == "die":
             time.sleep(0.3)
             os.kill(os.getpid(), signal.SIGKILL)
-        while what in ("hold", "loose", "deaf", "frozen") and not stop.asked:
+        while what in ("hold", "loose", "deaf", "frozen", "brake") and not stop.asked:
             time.sleep(0.01)
+        if what == "brake":
+            board.to(State.STOPPING)
+            while not (folder / "rest").exists():
+                time.sleep(0.01)
         if what == "identify":
             board.to(State.STOPPING)
             board.to(State.IDENTIFYING)

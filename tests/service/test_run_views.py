@@ -230,6 +230,12 @@ def test_two_runs_of_a_rig_give_its_torque_calibration(call, service, monkeypatc
         call("POST", "/rigs/a/calibration", 422, json={**body, **wrong})
     assert "not a run of rig b" in call("POST", "/rigs/b/calibration", 422, json=body)["error"]["message"]
     call("POST", "/rigs/a/calibration", 404, json={**body, "without": "../../x"})
+    both = call("POST", "/rigs/a/calibration", 422, json={**body, "added_kg_m2": 0.0, "added_sd_kg_m2": -1.0})
+    assert [one["option"] for one in both["fields"]] == ["added_kg_m2", "added_sd_kg_m2"]
+    with monkeypatch.context() as patched:
+        patched.setattr(service.store, "rehearsed", lambda run: run == loaded)
+        (field,) = call("POST", "/rigs/a/calibration", 422, json=body)["fields"]
+    assert field["option"] == "with_body" and "is a rehearsal of faults" in field["message"]
     (service.store.place(loaded) / "run.mcap").unlink()
     call("POST", "/rigs/a/calibration", 422, json=body)
     assert len(asked) == 1

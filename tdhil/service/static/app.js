@@ -210,11 +210,13 @@
   // -- rigs
 
   function rigCard(rig) {
+    const mayWatch = Boolean(document.body.dataset.known);
     const said = {
-      free: rig.simulated || rig.motion !== "never" ? tr("free") : tr("free; can't be moved from here (service.motion: {rule})", { rule: rig.motion }),
+      free: rig.simulated || rig.motion === "attended" ? tr("free") : rig.motion === "never" ? tr("free; can't be moved from here (service.motion: {rule})", { rule: rig.motion })
+        : mayWatch ? tr("free") : tr("free; moves only while a logged-in user watches it (service.motion: {rule})", { rule: rig.motion }),
       busy: tr("in use by a run"), held: tr("held by {holder}", { holder: rig.holder }), blocked: tr("blocked: a stop was not confirmed"), unusable: english(rig.problem),
     }[rig.state];
-    const mayStart = may("operator") && rig.state === "free" && (rig.simulated || rig.motion !== "never");
+    const mayStart = may("operator") && rig.state === "free" && (rig.simulated || rig.motion === "attended" || (rig.motion === "watched" && mayWatch));
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
@@ -273,11 +275,11 @@
     return found;
   }
 
-  /** Mark the fields whose values were refused, each with its reason, and go to the first one if `go`. */
+  /** Mark the fields whose values were refused, each with its reason, and go to the first one if `go`. `said`: a reason of this page. */
   function markWrong(form, fields, go = true) {
     const known = fields.filter((one) => form.elements[one.option]);
     known.forEach((one) => {
-      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, worded(one.message));
+      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.said ?? worded(one.message));
       field.setAttribute("aria-invalid", "true");
       field.setAttribute("aria-describedby", note.id);
       (field.closest("label") || field).append(note);
@@ -380,15 +382,17 @@
     let measuring = null, warned = false;
     const measure = async () => {
       where.className = "dim";
-      where.textContent = tr("Measuring whether this computer sustains the cycle rate …");
+      const over = waiting(where, tr("Measuring whether this computer sustains the cycle rate"), "pace");
       try {
         const { pace: found } = await call("GET", `/rigs/${encodeURIComponent(rig)}/pace`, undefined, {}, 60000);
+        over(true);
         if (box.checked) {
           where.className = found.holds ? "" : "alarm";
           show(where, english(found.text));
         }
         return found.holds;
       } catch (error) {
+        over(false);
         where.className = "alarm";
         where.textContent = error instanceof Refused ? error.message : tr("The cycle rate could not be measured.");
         return false;
@@ -410,12 +414,24 @@
     };
   }
 
+  /** The first run of a new rig: its steps, and a motion in the lower part of the speed window. */
+  function firstMotion(form, steps) {
+    const low = Number(steps.dataset.low), width = Number(steps.dataset.high) - low;
+    steps.hidden = false;
+    for (const [name, value] of [["offset_rad_s", low + 0.25 * width], ["amplitude_rad_s", 0.1 * width]]) {
+      const field = form.elements[name];
+      if (!field.value) field.value = local(String(Number(inSpeedUnit(value).toPrecision(3))));
+      opens(field);
+    }
+  }
+
   const PLAN_MS = 300000;      // a narrow tolerance on a computer under load
   function startPage() {
     const rig = document.body.dataset.rig;
     const form = byId("ask");
     if (!form) return;
     const paced = pacing(rig, form);
+    if (byId("first") && new URLSearchParams(location.search).get("first") === "true") firstMotion(form, byId("first"));
     let key = null, keyFor = "";
     /** Say an error with the labels of this form in place of the command line's options, and mark these fields. */
     function refuse(message, fields = []) {
@@ -470,10 +486,25 @@
 
   // -- live
 
+  /** When a stop was asked for, when the drive reacted, and when it stood still. */
+  function stopSteps(stop, asking = false) {
+    const steps = [];
+    if (asking && !stop.asked) steps.push(el("li", {}, tr("asking …")));
+    if (stop.asked) steps.push(el("li", {}, tr("asked {time}", { time: clock(stop.asked) })));
+    if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive reacted {time}", { time: clock(stop.seen) })));
+    if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}${tr("standstill {time}", { time: clock(stop.at_rest) })}`));
+    if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired stop")));
+    return steps;
+  }
+  const unwatched = (watch) => tr("This run was not watched: it was stopped at {time}.", { time: clock(watch.lost) });
+  /** The text of an event, in one line. */
+  const eventText = (one) => [one.time_s === null ? "" : `${fixed(one.time_s, 1)} s `, english(`${one.text.startsWith(`${one.kind}:`) ? "" : `${one.kind}: `}${one.text}`)];
+
   /** Draw J's interval over time: inner band without, outer band with the torque scale; dashed: --tolerance about the last J. */
   function inertiaPlot(where) {
-    let plot = null, known = [];
-    const { nearest, reading } = window.tdhil, read = reading(where, (at) => {
+    let known = [];
+    const chart = { where, plot: null, title: () => where.parentElement.querySelector("figcaption").textContent };
+    const { nearest, reading, toolbar, viewOf } = window.tdhil, read = reading(where, (at) => {
       const one = known[nearest(known.map((each) => each.time_s), at)];
       if (!one) return "–";
       const said = tr("{time} s: J = {inertia} kg·m²", { time: fixed(one.time_s, 1), inertia: interval(one.inertia_kg_m2, one.low_kg_m2, one.high_kg_m2) });
@@ -481,23 +512,30 @@
       return total.includes("(") ? tr("{reading}, with the torque scale {inertia}", { reading: said, inertia: total }) : said;
     });
     const data = () => ["time_s", "high_total_kg_m2", "low_total_kg_m2", "high_kg_m2", "low_kg_m2", "inertia_kg_m2"].map((name) => known.map((one) => one[name]));
+    const COLUMNS = ["time_s", "inertia_kg_m2", "low_kg_m2", "high_kg_m2", "low_total_kg_m2", "high_total_kg_m2"];
+    const view = viewOf([chart], {
+      tools: toolbar(where, tr("Interval of J over time")), least: 1, file: () => `${document.body.dataset.run}-inertia`,
+      whole: () => {      // uPlot would begin at 0 for a single answer
+        const low = known[0]?.time_s ?? 0, high = known[known.length - 1]?.time_s ?? 0, pad = 0.04 * (high - low) || 5;
+        return [low - pad, high + pad];
+      },
+      table: ([low, high]) => [COLUMNS.join(), ...known.filter((one) => one.time_s >= low && one.time_s <= high).map((one) => COLUMNS.map((name) => one[name] ?? "").join())],
+    });
     const draw = () => {
-      if (plot) plot.destroy();
+      if (chart.plot) chart.plot.destroy();
       const shade = colour("--c2"), edge = (width) => ({ stroke: shade, width, points: { show: false } });
-      plot = new uPlot({
-        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: read.cursor,
-        scales: { x: { time: false, range: () => {      // uPlot would begin at 0 for a single answer
-          const low = known[0]?.time_s ?? 0, high = known[known.length - 1]?.time_s ?? 0, pad = 0.04 * (high - low) || 5;
-          return [low - pad, high + pad];
-        } } },
+      chart.plot = new uPlot({
+        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { ...read.cursor, ...view.cursor },
+        scales: { x: { time: false, range: () => view.range() } },
         axes: [axis({ size: 34, values: (self, all) => all.map((one) => `${tick(one)} s`) }), axis({ size: 52 })],
         series: [{}, edge(0), edge(0), edge(1), edge(1), { stroke: shade, width: 2, points: { show: true, size: 7, fill: shade } }],
         bands: [{ series: [1, 2], fill: `${shade}22` }, { series: [3, 4], fill: `${shade}44` }],
-        hooks: { setCursor: read.setCursor, draw: [(self) => {
+        hooks: { setCursor: read.setCursor, setSelect: view.setSelect, draw: [(self) => {
           const last = known[known.length - 1];
           if (!last) return;
           const c = self.ctx;
           c.save();
+          c.beginPath(); c.rect(self.bbox.left, self.bbox.top, self.bbox.width, self.bbox.height); c.clip();
           c.strokeStyle = shade;
           c.lineWidth = 1.5 * devicePixelRatio;
           for (const one of known.filter((each) => each.low_kg_m2 !== null && each.high_kg_m2 !== null)) {   // a band alone shows nothing of the first answer
@@ -515,12 +553,13 @@
           c.restore();
         }] },
       }, data(), where);
+      view.again();
     };
-    new ResizeObserver(() => plot && plot.setSize({ width: where.clientWidth || 320, height: 190 })).observe(where);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => plot && draw());
+    new ResizeObserver(() => chart.plot && chart.plot.setSize({ width: where.clientWidth || 320, height: 190 })).observe(where);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => chart.plot && draw());
     return (all) => {
       known = all.filter((one) => one.inertia_kg_m2 !== null);
-      if (!plot) draw(); else plot.setData(data());
+      if (!chart.plot) draw(); else chart.plot.setData(data());
     };
   }
 
@@ -571,7 +610,7 @@
     function event(one) {
       const list = byId("events");
       if (one.kind === "preflight") return;
-      list.prepend(el("li", {}, one.time_s === null ? "" : `${fixed(one.time_s, 1)} s `, english(`${one.text.startsWith(`${one.kind}:`) ? "" : `${one.kind}: `}${one.text}`)));
+      list.prepend(el("li", {}, ...eventText(one)));
       while (list.children.length > 200) list.lastElementChild.remove();
     }
 
@@ -603,7 +642,8 @@
       byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
       const over = ENDED.includes(status.state);
       if (!over) wentOn = true;
-      if (status.state === "done" && wentOn) {                     // the page becomes the result, once
+      if (status.simulated) byId("simulated").hidden = false;       // a simulator on a bus is recognized in preflight
+      if (over && wentOn && !["stop_not_confirmed", "interrupted"].includes(status.state)) {      // the page becomes the result, once; a shaft that may still turn keeps its Stop
         try { sessionStorage.removeItem(STARTED); } catch (error) { /* nothing was kept */ }
         location.replace(`/runs/${run}`);
         return;
@@ -642,14 +682,7 @@
     }
 
     function stopTimes() {
-      const stop = (status && status.stop) || {};
-      const steps = [];
-      if (asking && !stop.asked) steps.push(el("li", {}, tr("asking …")));
-      if (stop.asked) steps.push(el("li", {}, tr("asked {time}", { time: clock(stop.asked) })));
-      if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive reacted {time}", { time: clock(stop.seen) })));
-      if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}${tr("standstill {time}", { time: clock(stop.at_rest) })}`));
-      if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired stop")));
-      show(byId("stop-times"), ...steps);
+      show(byId("stop-times"), ...stopSteps((status && status.stop) || {}, Boolean(asking)));
     }
 
     /** The stop is not acknowledged; or the run acknowledged it, and its drive does not react. */
@@ -726,7 +759,7 @@
       if (over) return;
       const unheard = mine && Date.now() - heard > SILENT_MS;
       where.className = watch.lost || watch.gone || unheard ? "alarm" : "";
-      const text = watch.lost ? tr("This run was not watched: it was stopped at {time}.", { time: clock(watch.lost) })
+      const text = watch.lost ? unwatched(watch)
         : unheard ? tr("The run receives nothing from this page: it stops 5 s after the last message.")
         : mine ? tr("You watch this run. If this page is hidden or closed for 5 s, the shaft stops.")
         : watch.gone ? tr("{name} watches this run on another page, which is {how} since {time}: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by, how: word(watch.how, "page"), time: clock(watch.gone) })
@@ -871,7 +904,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, byLabels, call, closes, colour, csrf, el, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, byLabels, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

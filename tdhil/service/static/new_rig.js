@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { english, local, point, tr, word, worded } = window.tdhilLanguage;
-  const { byId, call, closes, el, markWrong, pages, show, unmark, waiting, whyOf } = window.tdhil;
+  const { byId, call, closes, el, inSpeedUnit, markWrong, onSpeedUnit, pages, show, speedUnit, unmark, waiting, whyOf } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
   const KEPT = "tdhil-new-rig";      // what was typed, until the rig is saved or the tab is closed
 
@@ -19,16 +19,16 @@
       if (text !== undefined) one.textContent = text;
       return one;
     };
-    const round = (value) => local(Number(value.toPrecision(3)).toString());
-    const svg = draw("svg", { viewBox: `0 0 ${W} ${H}`, class: "window", role: "img", "aria-label": tr("Window of motion: {low} to {high} rad/s, at most {torque} N·m either way", { low: round(low), high: round(high), torque: round(torque) }) });
+    const speed = (value) => round(inSpeedUnit(value)), round = (value) => local(Number(value.toPrecision(3)).toString());
+    const svg = draw("svg", { viewBox: `0 0 ${W} ${H}`, class: "window", role: "img", "aria-label": tr("Window of motion: {low} to {high} {unit}, at most {torque} N·m either way", { low: speed(low), high: speed(high), unit: speedUnit(), torque: round(torque) }) });
     svg.append(
       draw("rect", { x: x(low), y: y(torque), width: x(high) - x(low), height: y(-torque) - y(torque), class: "inside" }),
       draw("line", { x1: left, x2: W - right, y1: y(0), y2: y(0), class: "axis" }),
       draw("line", { x1: x(0), x2: x(0), y1: top, y2: H - bottom, class: "axis" }),
       draw("line", { x1: x(0), x2: x(0), y1: y(Math.min(probe, torque)), y2: y(0), class: "probe" }));
     for (const nm of [torque, 0, -torque]) svg.append(draw("text", { x: left - 6, y: y(nm) + 4, "text-anchor": "end" }, round(nm)));
-    for (const speed of [low, high]) svg.append(draw("text", { x: x(speed), y: H - bottom + 16, "text-anchor": "middle" }, round(speed)));
-    svg.append(draw("text", { x: (left + W - right) / 2, y: H - 8, "text-anchor": "middle" }, tr("speed, rad/s")),
+    for (const end of [low, high]) svg.append(draw("text", { x: x(end), y: H - bottom + 16, "text-anchor": "middle" }, speed(end)));
+    svg.append(draw("text", { x: (left + W - right) / 2, y: H - 8, "text-anchor": "middle" }, tr("speed, {unit}", { unit: speedUnit() })),
       draw("text", { x: 14, y: (top + H - bottom) / 2, "text-anchor": "middle", transform: `rotate(-90 14 ${(top + H - bottom) / 2})` }, tr("torque, N·m")));
     return el("figure", {}, svg, el("figcaption", { class: "dim" },
       tr("Shaded: the window of a run. Thick: the sign probe, the first motion, with at most {torque} N·m. A stop from the highest speed takes {time} s.", { torque: round(probe), time: round(high / brake) })));
@@ -72,8 +72,8 @@
       byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it was reported yet.") : "";
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
-        one.by_hand.length ? el("p", {}, tr("Make these settings at the drive. A run is refused until it reads them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
-        one.by_hand.length ? el("ul", {}, ...one.by_hand.map((text) => el("li", {}, english(text)))) : null,
+        one.by_hand.length ? el("p", {}, tr("Make these settings at the drive, and tick each one. A run is refused until it reads them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
+        ...one.by_hand.map((text) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "made", value: text }), english(text))),
         doubts.length ? el("p", { "data-field": "accept_unverified" }, tr("These entries of the profile are not verified on a drive. Compare each with the drive's manual, and accept it:")) : null,
         ...doubts.map(([name, source]) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "accept", value: name }), english(`${name}: ${source}`))));
     }
@@ -96,7 +96,7 @@
     simulatedChanged();
 
     const fields = () => [...form.elements].filter((one) => one.name && !["BUTTON", "TEXTAREA"].includes(one.tagName));
-    const keyOf = (one) => (one.name === "accept" ? `accept:${one.value}` : one.name);
+    const keyOf = (one) => (["accept", "made"].includes(one.name) ? `${one.name}:${one.value}` : one.name);
     /** Put back what was typed before the page was loaded again. A field with a newer text keeps it. */
     function putBack(kept) {
       if (byName.has(kept.profile)) { field("profile").value = kept.profile; profileChanged(); }
@@ -140,7 +140,9 @@
       }
       return rest;
     }
-    const picture = (limits) => show(byId("window"), Object.keys(limits).length ? windowPicture(limits) : null);
+    let drawn = {};
+    const picture = (limits) => { drawn = limits; show(byId("window"), Object.keys(limits).length ? windowPicture(limits) : null); };
+    onSpeedUnit(() => picture(drawn));
     async function check() {
       unmark(form);
       said.hidden = true;
@@ -168,7 +170,7 @@
         if (!save || found.problems.length) return;
         const made = await call("POST", "/rigs", { id: field("id").value.trim(), text: found.text });
         try { sessionStorage.removeItem(KEPT); } catch (error) { /* nothing was kept */ }
-        location.assign(made.motion === "never" && !made.simulated ? "/" : `/start/${encodeURIComponent(made.id)}`);
+        location.assign(made.motion === "never" && !made.simulated ? "/" : `/start/${encodeURIComponent(made.id)}${made.simulated ? "" : "?first=true"}`);
       } catch (error) {
         refused(error);
       }

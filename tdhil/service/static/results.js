@@ -1,8 +1,8 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { coded, english, errorText, fixed, local, point, precise, tr, word } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, colour, el, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, show, span, speedUnit, submits, unmark, uploaded, waiting, when, whyOf, zone } = window.tdhil;
+  const { coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, show, span, speedUnit, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
@@ -10,9 +10,12 @@
     const result = run.result;
     const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
     if (run.error) parts.push(el("p", { class: wanted(run) ? "dim" : "alarm" }, errorText(run.error)));
+    if (run.watch && run.watch.lost) parts.push(el("p", { class: "alarm" }, unwatched(run.watch)));
+    const steps = stopSteps(run.stop);
+    if (steps.length && ENDED.includes(run.state)) parts.push(el("ol", { class: "stop-times", "aria-label": tr("Stop") }, ...steps));
     if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, tr("Live"))));
     parts.push(...rehearsed(run));
-    parts.push(...accepted(result));
+    if (result && result.acceptance) parts.push(el("p", { class: `verdict ${ACCEPTED[result.acceptance.verdict] || "fair"}` }, el("a", { href: "#accepted" }, tr("Acceptance")), `: ${word(result.acceptance.verdict, "verdict")}`));
     if (!result) {
       if (ENDED.includes(run.state) && run.files.includes("run.mcap")) parts.push(el("p", { class: "dim" }, tr("No J: the run ended before its data determined one. The recorded motion is kept.")));
       return parts;
@@ -47,16 +50,16 @@
   function accepted(result) {
     const found = result && result.acceptance;
     if (!found) return [];
-    const colour = { pass: "good", fail: "bad" }, short = (value) => local(String(Number(value.toPrecision(5))));
+    const short = (value) => local(String(Number(value.toPrecision(5))));
     const wide = found.quantities.some((one) => !["pass", "fail"].includes(one.verdict) && one.value !== null);
     return [el("section", { class: "card" }, el("h2", {}, tr("Acceptance")),
-      el("p", { class: `verdict ${colour[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
+      el("p", { class: `verdict ${ACCEPTED[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
       ...found.off.map((one) => el("p", { class: "alarm" }, ...coded(found.code, `${one} [${found.code}]`))),
       region(tr("Acceptance"), el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...[tr("quantity"), tr("expected"), tr("identified"), tr("verdict")].map((one) => el("th", { scope: "col" }, one)))),
         el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.label)),
-          el("td", {}, `${short(one.expected)} ± ${short(one.tolerance)} ${one.unit}`),
-          el("td", {}, one.value === null ? tr("not identified") : `${of(one)} ${one.unit}`),
-          el("td", { class: `verdict ${colour[one.verdict] || "fair"}` }, word(one.verdict, "verdict"))))))),
+          el("td", {}, typeof one.expected === "string" ? one.expected : `${short(one.expected)} ± ${short(one.tolerance)} ${one.unit}`),
+          el("td", {}, one.value === null ? tr("not identified") : typeof one.value === "string" ? one.value : `${of(one)} ${one.unit}`),
+          el("td", { class: `verdict ${ACCEPTED[one.verdict] || "fair"}` }, word(one.verdict, "verdict"))))))),
       wide ? el("p", {}, tr("An interval overlaps the edge of its tolerance. Calibrate the torque, or measure for longer.")) : null)];
   }
   /** The verdict on rehearsed faults: required and seen. */
@@ -70,6 +73,7 @@
       el("p", { class: `verdict ${{ pass: "good", fail: "bad" }[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
       region(tr("Rehearsal"), el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))))];
   }
+  const ACCEPTED = { pass: "good", fail: "bad" };
   const ENDED_EARLY = "TDH-030";
   const VERDICTS = { valid: "good", valid_wide: "fair", not_identifiable: "bad", model_rejected: "bad" };
 
@@ -93,13 +97,15 @@
   /** Whether an operator stopped the run on purpose: its end is no alarm. */
   const wanted = (run) => run.state === "stopped" && Boolean(run.stop.asked) && !(run.watch && run.watch.lost);
 
-  /** The report's pictures, and the friction curve in numbers below its own. */
+  /** The report's pictures: the first one above the budget, the others below it with the friction curve in numbers. */
   async function pictures(id, result) {
     const found = await call("GET", `/runs/${id}/pictures`);
     const bars = ((result && result.budget) || []).length > 0;             // the page has its own bars of the budget
-    show(byId("pictures"), ...found.filter((one) => !bars || one.heading !== byId("budget").dataset.heading).flatMap((one) => [
+    const [first = [], ...others] = found.filter((one) => !bars || one.heading !== byId("budget").dataset.heading).map((one) => [
       el("h2", {}, word(one.heading)),
-      el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]));
+      el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]);
+    show(byId("picture"), ...first);
+    show(byId("pictures"), ...others.flat());
     const curve = (result && result.friction_curve) || [];
     if (curve.length) byId("pictures").append(numbers(tr("Friction over speed, in numbers"), [tr("speed"), tr("torque, N·m")],
       curve.map((one) => [ofSpeed(() => `${number(inSpeedUnit(one.speed_rad_s))} ${speedUnit()}`), of(one.torque_nm)])));
@@ -126,6 +132,7 @@
       shown = now;
       show(byId("result"), ...resultOf(run));
       show(byId("budget"), ...budgetOf(run.result));
+      show(byId("accepted"), ...accepted(run.result));
       show(byId("stages"), ...stagesOf(run.result));
       byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
@@ -195,18 +202,33 @@
         if (found.state === "done") { said.textContent = tr("Replay {number} below has these settings.", { number: Number(found.name) }); said.className = "dim"; said.hidden = false; }
       });
     });
+    events(id);
     annotations(id);
     signature(id);
     evidence(id);
     const sign = byId("sign");
-    if (sign) sign.addEventListener("submit", async (event) => {
+    if (sign) sign.addEventListener("submit", (event) => {
       event.preventDefault();
-      try {
+      submits(sign, byId("sign-said"), async () => {
         await call("POST", `/runs/${id}/sign-off`, { note: sign.elements.note.value });
         location.reload();
-      } catch (error) {
-        away(error.message);
-      }
+        return LEAVES;
+      });
+    });
+  }
+
+  /** The events of the log, the latest first, once their part is opened: the log has them, not the result. */
+  function events(id) {
+    const box = byId("log-events"), list = box && box.querySelector("ol");
+    let socket = null;
+    if (box) box.addEventListener("toggle", () => {
+      if (!box.open || socket) return;
+      socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${API}/live/${id}`);
+      socket.addEventListener("message", (event) => {
+        const found = JSON.parse(event.data);
+        if (found.type === "hello") list.replaceChildren();
+        for (const one of found.events || []) list.prepend(el("li", {}, ...eventText(one)));
+      });
     });
   }
 
@@ -407,9 +429,10 @@
 
   /**
    * Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn again for another width or
-   * colour scheme. `nameOf` names a point, `unit` is that of its value. `speed`: x is a speed in rad/s.
+   * colour scheme. `nameOf` names a point, `unit` is that of its value, `title` is that of the chart. `speed`: x is a
+   * speed in rad/s.
    */
-  function points(where, series, { label, nameOf, unit, time = false, speed = false, marks = [] }) {
+  function points(where, series, { title, label, nameOf, unit, time = false, speed = false, marks = [] }) {
     const all = series.flatMap((one) => one.points), shown = speed ? inSpeedUnit : (x) => x;
     const places = [...new Set(all.map((one) => one.x))].sort((a, b) => a - b);
     let xs = places.map(shown);
@@ -418,21 +441,33 @@
       const here = series.flatMap((one, k) => one.points.filter((point) => point.x === x).map((point) => [k, point]));
       return `${nameOf(here[0][1])}: ${here.map(([k, point]) => (series.length > 1 ? tr("run {number}: {value}", { number: k + 1, value: valueOf(point) }) : valueOf(point))).join("; ")}`;
     });
-    const low = Math.min(...all.map((one) => one.low ?? one.value)), high = Math.max(...all.map((one) => one.high ?? one.value));
-    const pad = 0.1 * (high - low) || 0.05 * Math.abs(high) || 1, sideOf = () => Math.max(0.06 * (xs[xs.length - 1] - xs[0]), time ? 60 : 1e-3);
-    let plot = null;
+    const side = () => Math.max(0.06 * (xs[xs.length - 1] - xs[0]), time ? 60 : 1e-3);
+    const inside = (point, [from, to]) => shown(point.x) >= from && shown(point.x) <= to;
+    const chart = { where, plot: null, title: () => title }, view = viewOf([chart], {
+      tools: toolbar(where, title), least: time ? 60 : 1e-3, whole: () => [xs[0] - side(), xs[xs.length - 1] + side()],
+      file: () => title.replace(/[^\p{L}\p{N}]+/gu, "-").toLowerCase(),
+      table: (range) => [`run,${time ? "date" : speed ? "speed_rad_s" : "frequency_hz"},value,low,high,unit`, ...series.flatMap((one, k) => one.points.filter((point) => inside(point, range))
+        .map((point) => [k + 1, time ? new Date(1000 * point.x).toISOString() : point.x, point.value, point.low ?? "", point.high ?? "", unit].join()))],
+    });
+    /** Range of the values in view; of all if none is in view. */
+    const heights = () => {
+      const seen = all.filter((point) => inside(point, view.range())), some = seen.length ? seen : all;
+      const low = Math.min(...some.map((one) => one.low ?? one.value)), high = Math.max(...some.map((one) => one.high ?? one.value));
+      const pad = 0.1 * (high - low) || 0.05 * Math.abs(high) || 1;
+      return [low - pad, high + pad];
+    };
     const draw = () => {
-      if (plot) plot.destroy();
+      if (chart.plot) chart.plot.destroy();
       xs = places.map(shown);
-      const side = sideOf();
-      plot = new uPlot({
-        width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: read.cursor,
-        scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
+      chart.plot = new uPlot({
+        width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { ...read.cursor, ...view.cursor },
+        scales: { x: { time, range: () => view.range() }, y: { range: heights } },
         axes: [axis({ size: 48, label: time ? tr("local time, {zone}", { zone: zone(new Date(1000 * xs[xs.length - 1])) }) : label(), labelSize: 22, ...(time ? { values: TIMES } : {}) }), axis({ size: 62 })],
         series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
-        hooks: { setCursor: read.setCursor, draw: [(self) => {
+        hooks: { setCursor: read.setCursor, setSelect: view.setSelect, draw: [(self) => {
           const c = self.ctx, px = devicePixelRatio;
           c.save();
+          c.beginPath(); c.rect(self.bbox.left, self.bbox.top, self.bbox.width, self.bbox.height); c.clip();
           c.lineWidth = 2 * px;
           c.strokeStyle = colour("--limit");
           c.setLineDash([6 * px, 4 * px]);
@@ -455,11 +490,12 @@
           c.restore();
         }] },
       }, [xs, ...series.map(() => xs.map(() => null))], where);
+      view.again();
     };
     draw();
-    new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 240 })).observe(where);
+    new ResizeObserver(() => chart.plot.setSize({ width: where.clientWidth || 320, height: 240 })).observe(where);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-    if (speed) onSpeedUnit(draw);
+    if (speed) onSpeedUnit(() => { xs = places.map(shown); view.look(null); draw(); });
   }
 
   async function once(where, look, text = tr("Loading"), kind = "faults") {
@@ -501,7 +537,7 @@
           el("figure", {}, el("figcaption", {}, tr("each point with its repeatability on this drive; dashed: a change")), plot, el("p", { class: "dim said" }, where.dataset.said)),
           numbers(tr("{quantity} in numbers", { quantity: word(quantity.name) }), [tr("run"), tr("{unit}, interval", { unit: quantity.unit })], quantity.points.map((one) => [el("span", {}, el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), " ", rehearsal(one.rehearsed_faults) || ""), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
-          { time: true, nameOf: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
+          { title: `${word(quantity.name)}, ${quantity.unit}`, time: true, nameOf: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
     }, tr("The results are compared"), "history");
   }
@@ -526,7 +562,7 @@
         const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
         if (!series.some((one) => one.points.length)) return [];
         const plot = el("div", { class: "plot", role: "img", "aria-label": title });
-        setTimeout(() => points(plot, series, { label, nameOf, unit, speed }), 0);             // after it has a width
+        setTimeout(() => points(plot, series, { title, label, nameOf, unit, speed }), 0);             // after it has a width
         return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot, el("p", { class: "dim said" }, said)),
           numbers(tr("{title}, in numbers", { title }), [speed ? ofSpeed(label) : label(), ...names], tabled(series, speed ? (x) => ofSpeed(() => number(inSpeedUnit(x))) : number))];
       };
@@ -567,17 +603,27 @@
       const text = `${fault.name}${moment}${value ? `=${value}` : ""}${!fault.from_start && seconds("duration") ? `/${seconds("duration")}s` : ""}`;
       unmark(form);
       const wrong = ["after", "duration"].filter((name) => !/^\d*\.?\d*$/.test(seconds(name)));
-      if (wrong.length) { markWrong(form, wrong.map((option) => ({ option, message: tr("Give a number of seconds, such as 2.5.") }))); return; }
+      if (wrong.length) { markWrong(form, wrong.map((option) => ({ option, said: tr("Give a number of seconds, such as 2.5.") }))); return; }
       button.disabled = true;
       if (!await paced()) { button.disabled = false; return; }
       try {
         const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, { fault: [text], note: `rehearsal: ${text}`, real_time: form.elements.real_time.checked }, { "Idempotency-Key": crypto.randomUUID() });
         follow(run.id);
       } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, whyOf(error)));
-        byId("said").scrollIntoView({ block: "center" });
+        const [wrong] = error.fields || [];
+        refuse(wrong ? worded(wrong.message) : whyOf(error), button);
         button.disabled = false;
       }
+    }
+    /** Show a refusal at the fault that was chosen: its value is marked. */
+    function refuse(why, button) {
+      const row = button.closest("li"), field = row.querySelector("input"), note = el("span", { class: "alarm wrong", role: "alert", id: "wrong-fault" }, why);
+      row.append(note);
+      if (field) {
+        field.setAttribute("aria-invalid", "true");
+        field.setAttribute("aria-describedby", note.id);
+        field.focus();
+      } else note.scrollIntoView({ block: "center" });
     }
     once(byId("said"), async () => {
       const faults = await call("GET", `/rigs/${encodeURIComponent(rig)}/faults`);
@@ -597,11 +643,11 @@
   function calibratePage() {
     const rig = document.body.dataset.rig, form = byId("calibrate"), runs = new Map();
     if (!form) return;
-    const choices = [form.elements.without, form.elements.with_body];
+    const choices = [form.elements.without, form.elements.with_body], said = byId("calibrate-said");
     const named = (run) => `${when(run.asked)}, ${word(run.verdict, "verdict")}: ${tr("J as reported {inertia}", { inertia: inertia(run) })}`;
     let shown = "";
     every(2000, async () => {
-      const found = (await call("GET", `/runs?rig=${encodeURIComponent(rig)}&state=done`)).filter((run) => run.inertia_kg_m2 !== null), now = JSON.stringify(found);
+      const found = (await call("GET", `/runs?rig=${encodeURIComponent(rig)}&state=done`)).filter((run) => run.inertia_kg_m2 !== null && !run.rehearsal), now = JSON.stringify(found);
       if (now === shown) return;
       shown = now;
       for (const run of found) runs.set(run.id, run);
@@ -615,23 +661,35 @@
       const text = point(form.elements[name].value);
       return text === "" ? null : Number(text);
     };
-    form.addEventListener("submit", async (event) => {
+    /** Return what can't be used, each field with its reason. */
+    function mistakes(added, sd) {
+      const wrong = choices.filter((one) => !one.value).map((one) => ({ option: one.name, said: tr("Choose a run.") }));
+      if (!wrong.length && choices[0].value === choices[1].value) wrong.push({ option: "with_body", said: tr("Choose two different runs.") });
+      if (!(added > 0)) wrong.push({ option: "added_kg_m2", said: tr("Give the inertia of the body as a positive number of kg·m².") });
+      if (sd !== null && !(sd >= 0)) wrong.push({ option: "added_sd_kg_m2", said: tr("Give the standard uncertainty as a number of kg·m².") });
+      return wrong;
+    }
+    form.addEventListener("submit", (event) => {
       event.preventDefault();
-      const added = decimal("added"), sd = decimal("added_sd"), button = form.querySelector("button");
-      const wrong = choices.some((one) => !one.value) ? tr("Choose both runs.") : choices[0].value === choices[1].value ? tr("Choose two different runs.")
-        : !(added > 0) ? tr("Give the inertia of the body as a positive number of kg·m².") : sd !== null && !(sd >= 0) ? tr("Give the standard uncertainty as a number of kg·m².") : "";
-      if (wrong) return show(byId("said"), el("p", { class: "alarm", role: "alert" }, wrong));
-      button.disabled = true;
-      show(byId("said"), el("p", { class: "dim" }, tr("Both logs are identified …")));
-      try {
-        const body = { without: choices[0].value, with_body: choices[1].value, added_kg_m2: added, added_sd_kg_m2: sd, at: form.elements.at.value };
-        const { calibration } = await call("POST", `/rigs/${encodeURIComponent(rig)}/calibration`, body, {}, 300000);
-        show(byId("said"), ...calibrated(calibration));
-      } catch (error) {
-        show(byId("said"), el("p", { class: "alarm", role: "alert" }, whyOf(error)));
-      }
-      button.disabled = false;
-      byId("said").scrollIntoView({ block: "nearest" });
+      const added = decimal("added_kg_m2"), sd = decimal("added_sd_kg_m2"), wrong = mistakes(added, sd);
+      show(byId("said"));
+      submits(form, said, async () => {
+        if (markWrong(form, wrong)) return;
+        const over = waiting(byId("said"), tr("Both logs are identified"), "calibrate"), opens = closes(form.querySelectorAll("button"));
+        try {
+          const body = { without: choices[0].value, with_body: choices[1].value, added_kg_m2: added, added_sd_kg_m2: sd, at: form.elements.at.value };
+          const { calibration } = await call("POST", `/rigs/${encodeURIComponent(rig)}/calibration`, body, {}, 300000);
+          over(true);
+          show(byId("said"), ...calibrated(calibration));
+          byId("said").scrollIntoView({ block: "nearest" });
+        } catch (error) {
+          over(false);
+          show(byId("said"));
+          throw error;
+        } finally {
+          opens();
+        }
+      });
     });
   }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import shutil
 import socket
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from tdhil.service.store import write_json
+from tests.recording.test_log_tail import write
 from tests.service.conftest import Service, wait_for
 
 CHROMIUM = os.environ.get("TDHIL_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -28,7 +30,9 @@ IN_CHROMIUM = [
 """Marks of each file of this folder."""
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
 PAGES = ("/", "/new-rig", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/upload", "/fleets", "/audit",
-         "/docs", "/letterhead")
+         "/docs", "/letterhead", "/rigs/a/file", "/start/watched", "/start/real")
+TRACE = "Zeit;Drehzahl soll;Drehzahl ist;Drehmoment\nms;U/min;U/min;%\n" + "".join(
+    f"{10 * k};40,0;{40 + k % 7},5;{20 + k % 5},25\n" for k in range(400))
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},
@@ -125,6 +129,31 @@ def results(served: Served, run: str, monkeypatch: pytest.MonkeyPatch) -> tuple[
     write_json(folder / "row.json", asdict(row))
     return (f"/runs/{run}", f"/compare?runs={run},{second(served, run)}", f"/rigs/{store.request(run).rig}",
             "/fleets/0123456789ab")
+
+
+def judge(served: Served, run: str) -> None:
+    """Give a run an acceptance that fails, the verdict on a rehearsal, stages and events, each with foreign text."""
+    folder = served.service.store.place(run)
+    rows = [{"name": "inertia", "label": "moment of inertia J", "unit": "kg·m²", "expected": 95.0, "tolerance": 1.0,
+             "value": 104.0, "low": 100.0, "high": 108.0, "verdict": "fail", "text": HOSTILE},
+            {"name": "drive-serial", "label": "serial number of the drive", "unit": "", "expected": HOSTILE,
+             "tolerance": 0.0, "value": HOSTILE, "low": None, "high": None, "verdict": "pass", "text": HOSTILE}]
+    write_json(folder / "result.json", json.loads((folder / "result.json").read_bytes()) | {
+        "acceptance": {"verdict": "fail", "code": "TDH-1202", "off": [HOSTILE], "quantities": rows},
+        "stages": [{"name": "setup", "outcome": "aborted", "duration_s": 2.0, "detail": HOSTILE}]})
+    write_json(folder / "state.json", json.loads((folder / "state.json").read_bytes()) | {"rehearsal": {
+        "verdict": "fail", "seen": HOSTILE,
+        "faults": [{"fault": HOSTILE, "row": 118, "required": HOSTILE, "codes": [6, 9], "verdict": "fail"}]}})
+    write(folder / "other.mcap")
+    (folder / "other.mcap").replace(folder / "run.mcap")
+
+
+def asks_with_a_checklist(served: Served) -> str:
+    """Return a run that waits for its code, with a point to tick."""
+    supervisor = served.service.supervisor
+    run = supervisor.start_run("rehearsed", {"note": "ask", "operator": "[ ] brake released"}, "local").request.id
+    served.service.wait(run, "awaiting_confirmation")
+    return str(run)
 
 
 def second(served: Served, run: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -51,6 +52,42 @@ def test_a_history_and_a_comparison_show_the_values_under_the_cursor(page, serve
     plot.locator("canvas").wait_for()
     inertia = "104.0 (102.9 to 105.1) kg·m²"
     assert read(page, plot, 0.1) == f"0.1000 Hz: run 1: {inertia}; run 2: {inertia}"
+
+
+@pytest.mark.heavy
+def test_a_history_can_be_zoomed_panned_and_exported(page, served, monkeypatch):
+    _, _, history, _ = results(served, ended(served), monkeypatch)
+    page.goto(history)
+    page.locator(".plot canvas").first.wait_for()
+    tools = page.get_by_role("toolbar", name="View: inertia, kg·m²")
+    whole = tools.get_by_role("button", name="Whole")
+
+    def saved(name: str) -> bytes:
+        with page.expect_download() as download:
+            tools.get_by_role("button", name=name, exact=True).click()
+        assert download.value.suggested_filename == f"inertia-kg-m².{name.lower()}"
+        return Path(download.value.path()).read_bytes()
+
+    def rows() -> list[str]:
+        head, *found = saved("CSV").decode().splitlines()
+        assert head == "run,date,value,low,high,unit"
+        return [one.split(",")[1][:10] for one in found]
+
+    assert whole.is_disabled() and rows() == ["2026-05-01", "2026-06-01"]
+    tools.get_by_role("button", name="Zoom in").click()
+    assert rows() == []
+    for _ in range(2):
+        tools.get_by_role("button", name="To the left").click()
+    assert rows() == ["2026-05-01"] and saved("PNG").startswith(b"\x89PNG")
+    assert "2026-05-01" in read(page, page.locator(".plot").first, 0.1)
+    whole.click()
+    assert whole.is_disabled() and len(rows()) == 2
+    box = page.locator(".plot .u-over").first.bounding_box()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.98 * box["width"], box["y"] + 40, steps=4)
+    page.mouse.up()
+    assert rows() == ["2026-06-01"]
 
 
 @pytest.mark.heavy

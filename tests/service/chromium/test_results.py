@@ -7,6 +7,7 @@ import os
 import re
 import threading
 import zipfile
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from unittest.mock import Mock
@@ -18,7 +19,7 @@ from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import Told
 from tdhil.service.store import write_json
 from tests.recording.test_log_tail import write
-from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, begin, estimate, results
+from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, TRACE, begin, estimate, results
 from tests.service.conftest import play_uploads, wait_for
 
 pytestmark = IN_CHROMIUM
@@ -26,8 +27,6 @@ REHEARSAL = {
     "verdict": "fail", "seen": "the run went on to its end (exit 0): valid, J 115 (110 to 119) kg·m²",
     "faults": [{"fault": "torque-scale=1.1", "row": 118, "required": "QS, no J", "codes": [6, 9], "verdict": "fail"}],
 }
-TRACE = "Zeit;Drehzahl soll;Drehzahl ist;Drehmoment\nms;U/min;U/min;%\n" + "".join(
-    f"{10 * k};40,0;{40 + k % 7},5;{20 + k % 5},25\n" for k in range(400))
 
 
 @pytest.mark.heavy
@@ -357,17 +356,92 @@ def test_a_rehearsal_is_marked_wherever_its_run_is_shown(page, served):
     page.get_by_role("article", name="Rig a").get_by_text("no result yet").wait_for()
 
 
+@pytest.mark.heavy
+def test_one_run_has_one_time_on_each_page(browser, served, monkeypatch):
+    """On the list, its page, the history and the comparison: the time of its request, in the reader's zone."""
+    from tdhil.fleet import FleetRow, trend_document
+
+    ids = []
+    for _ in range(3):
+        run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+        served.service.wait(run, "done")
+        row = FleetRow(run, "valid", rig="a", date="2020-01-01T00:00:00+00:00", inertia_kg_m2=104.0,
+                       inertia_low_kg_m2=103.0, inertia_high_kg_m2=105.0, confidence=0.95, simulated=True)
+        write_json(served.service.store.place(run) / "row.json", asdict(row))
+        (served.service.store.place(run) / "run.mcap").write_bytes(b"log")
+        ids.append((run, asdict(row)))
+
+    def work(what, of, asked):
+        if what == "trend":
+            return {"document": trend_document([FleetRow(**one) for one in asked["rows"]], "a", rehearsals=True)}
+        return {"document": {"results": [row for _, row in ids[:2]], "apparent_inertia": [[], []], "friction": [[], []],
+                             "differences": [], "settings": [
+                                 {"name": "date", "values": ["2020-01-01"] * 2, "differs": False}]}}
+
+    monkeypatch.setattr(served.service.supervisor, "work", work)
+    run = ids[0][0]
+    context = browser.new_context(base_url=served.url, timezone_id="Asia/Kolkata")
+    page = context.new_page()
+    page.goto(f"/runs/{run}")
+    page.locator("#result .figure").wait_for()
+    time = page.locator("main time").first.inner_text()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC\+05:30", time)
+    page.goto("/runs")
+    page.locator("#runs tr", has=page.locator(f"a[href='/runs/{run}']")).get_by_role("cell", name=time).wait_for()
+    page.goto("/rigs/a")
+    page.get_by_text("inertia in numbers").click()
+    page.locator(f"#history a[href='/runs/{run}']", has_text=time).first.wait_for()
+    page.goto(f"/compare?runs={run},{ids[1][0]}")
+    page.locator(f"th a[href='/runs/{run}']", has_text=f"a, {time}").first.wait_for()
+    page.get_by_role("row", name="date").get_by_role("cell", name=time).first.wait_for()
+    context.close()
+
+
+@pytest.mark.heavy
+def test_a_stopped_run_is_compared_and_each_verdict_has_its_colour(page, served, monkeypatch):
+    from tdhil.fleet import FleetRow
+
+    runs = [begin(served)]
+    served.service.supervisor.stop(runs[0], "local")
+    served.service.wait(runs[0], "stopped")
+    for _ in range(2):
+        runs.append(served.service.supervisor.start_run("b", {"note": "done"}, "local").request.id)
+        served.service.wait(runs[-1], "done")
+    inertia = {**estimate(104.0), "low_total": 100.0, "high_total": 108.0}
+    for run, verdict in zip(runs, ("valid", "valid_wide", "not_identifiable"), strict=True):
+        write_json(served.service.store.place(run) / "result.json", {"verdict": verdict, "inertia_kg_m2": inertia})
+        (served.service.store.place(run) / "run.mcap").write_bytes(b"log")
+        served.service.supervisor.index.put(served.service.store.summary(run))
+    page.goto("/runs")
+    rows = {run: page.locator("#runs tr", has=page.locator(f"a[href='/runs/{run}']")) for run in runs}
+    rows[runs[0]].get_by_text("stopped, at standstill").wait_for()
+    colours = [rows[run].locator(".verdict").evaluate("one => getComputedStyle(one).color") for run in runs]
+    assert len({*colours, page.evaluate("getComputedStyle(document.body).color")}) == 4
+    assert rows[runs[0]].locator("th, td:not(.pick)").first.inner_text().startswith("a")         # the rig comes first
+    assert page.locator("thead th").nth(1).inner_text().strip().lower().startswith("rig")
+    rows_of = [asdict(FleetRow(run, "valid", rig="a", inertia_kg_m2=104.0, aborted_by="operator")) for run in runs[:2]]
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": {
+        "results": rows_of, "differences": [], "settings": [], "apparent_inertia": [], "friction": []}})
+    for run in runs[:2]:
+        rows[run].get_by_role("checkbox").check()
+    page.get_by_role("button", name="Compare").click()
+    page.wait_for_url("**/compare?runs=*,*")
+    page.locator(f"th a[href='/runs/{runs[0]}']").first.wait_for()
+
+
 def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
     write(served.service.store.place(run) / "run.mcap")         # 0 to 1.99 s, speed 10 rad/s², torque -20 N·m/s
     page.goto(f"/runs/{run}/live")
     charts, readout = page.locator("#plot-speed .u-over, #plot-torque .u-over"), page.locator("#readout")
-    whole, box = page.get_by_role("button", name="Whole run"), charts.first.bounding_box()
+    whole = page.get_by_role("button", name="Whole run")
     wait_for("the samples", lambda: page.evaluate("document.getElementById('speed').textContent") != "–")
     assert whole.is_disabled()
 
     def move(share: float) -> list[float]:
+        charts.first.scroll_into_view_if_needed()
+        box = charts.first.bounding_box()
         page.mouse.move(box["x"] + share * box["width"], box["y"] + 40, steps=3)
         readout.get_by_text("N·m").wait_for()
         return [float(one) for one in re.findall(r"-?[\d.]+", readout.inner_text().replace("N·m", ""))]
@@ -391,6 +465,24 @@ def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
     assert head == "time_s,speed_rad_s,torque_nm" and 9 <= len(rows) <= 15      # spacing 0.04 or 0.05 s
     assert all(0.45 <= float(row.split(",")[0]) <= 1.05 for row in rows)
     assert saved("PNG").startswith(b"\x89PNG")
+    whole.click()
+
+    def seen() -> tuple[float, float]:
+        return move(0.0)[0], move(0.999)[0]
+
+    for name, part in (("Zoom in", (0.5, 1.5)), ("Zoom in", (0.75, 1.25)), ("Later", (0.87, 1.37)),
+                       ("Earlier", (0.75, 1.25)), ("Zoom out", (0.5, 1.5))):
+        page.get_by_role("button", name=name).click()
+        assert seen() == pytest.approx(part, abs=0.07), name
+    move(0.5)
+    page.mouse.wheel(100, 0)                                    # sideways
+    assert seen() == pytest.approx((0.56, 1.56), abs=0.07)
+    move(0.5)
+    page.keyboard.down("Control")
+    page.mouse.wheel(0, -100)
+    page.keyboard.up("Control")
+    assert seen() == pytest.approx((0.71, 1.42), abs=0.07)
+    whole.click()
     page.get_by_role("button", name="Speeds in rad/s").click()
     time_s, speed_rpm, _ = move(0.5)
     assert "rpm" in readout.inner_text() and speed_rpm == pytest.approx(95.5 * time_s, rel=0.02)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
 from tdhil.service.store import write_json
-from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, estimate, second
+from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, begin, estimate, second
 from tests.service.conftest import wait_for
 
 pytestmark = IN_CHROMIUM
@@ -47,9 +48,43 @@ def test_what_cant_be_done_here_says_why_before_the_click(page, served):
     page.goto("/start/watched")
     page.get_by_text("This rig moves only while a logged-in user watches it").wait_for()
     assert page.get_by_role("button", name="Start").count() == 0
+    page.goto("/")
+    card = page.get_by_role("article", name="watched", exact=True)
+    card.get_by_text("free; moves only while a logged-in user watches it").wait_for()
+    assert card.get_by_role("link", name="Start").count() == 0
+    assert page.get_by_role("article", name="real", exact=True).get_by_role("link", name="Start").count() == 1
     page.goto("/rigs/a/file")
     page.get_by_text("Read-only: this service has no accounts").wait_for()
     assert not page.get_by_text("You can change here").is_visible()
+
+
+def test_a_rehearsal_with_a_wrong_value_says_so_at_that_fault(page, served):
+    page.goto("/rehearse/a")
+    button = page.get_by_role("button", name="Rehearse torque-scale", exact=True)
+    row = page.locator("#faults li", has=button)
+    row.get_by_role("textbox").fill("abc")
+    button.click()
+    row.locator(".wrong").wait_for()
+    assert row.get_by_role("textbox").get_attribute("aria-invalid") == "true"
+    assert "--fault" not in row.inner_text() and "torque-scale" in row.locator("strong").inner_text()
+    assert served.service.store.ids() == []
+    row.get_by_role("textbox").fill("1.1")
+    button.click()
+    page.wait_for_url("**/runs/**")
+
+
+def test_the_code_page_marks_a_simulated_drive_also_one_that_preflight_finds_on_a_bus(page, served):
+    run = begin(served, "ask", "rehearsed")
+    page.goto(f"/runs/{run}/live")
+    page.get_by_label("Six digits").wait_for()
+    page.locator("h1").get_by_text("SIMULATED").wait_for()
+    run = begin(served, "ask", "real")
+    page.goto(f"/runs/{run}/live")
+    page.get_by_label("Six digits").wait_for()
+    assert not page.locator("h1").get_by_text("SIMULATED").is_visible()
+    path = served.service.store.place(run) / "state.json"
+    write_json(path, json.loads(path.read_bytes()) | {"simulated": True})
+    page.locator("h1").get_by_text("SIMULATED").wait_for()
 
 
 @pytest.mark.heavy
@@ -113,19 +148,26 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
                         ("Longest run", "15 min"), ("Deceleration of a stop", "2"),
                         ("Highest torque of the sign", "200"), ("Farthest travel", "3")):
         box(label).fill(text)
-    for one in page.locator("[name=accept]").all():
+    for one in page.locator("[name=accept], [name=made]").all():
         one.check()
     page.get_by_role("button", name="Check").click()
     page.get_by_text("The file is complete.").wait_for()
     page.reload()
+    page.locator("[name=made]").first.wait_for()
+    assert all(one.is_checked() for one in page.locator("[name=made]").all())
     page.get_by_label("Id:").fill("bench 3!")
     page.get_by_role("button", name="Save the rig").click()
     page.locator("#wrong-id").get_by_text("must be letters, digits").wait_for()
     page.get_by_label("Id:").fill("bench-3")
     page.get_by_role("img", name="Window of motion: 0.524 to 9.95 rad/s, at most 400 N·m").wait_for()
+    page.get_by_role("button", name="Speeds in rad/s").click()
+    page.get_by_role("img", name="Window of motion: 5 to 95 rpm, at most 400 N·m").wait_for()
     page.get_by_role("button", name="Save the rig").click()
-    page.wait_for_url("**/start/bench-3")
+    page.wait_for_url("**/start/bench-3?first=true")
     page.get_by_role("button", name="Start: preflight, then the code").wait_for()
+    page.get_by_role("heading", name="First motion of this rig").wait_for()          # its steps, and a careful plan
+    page.get_by_text("The shaft moves for the first time: at most 200 N·m and 3 rad.").wait_for()
+    assert [page.locator(f"[name={name}_rad_s]").input_value() for name in ("offset", "amplitude")] == ["2.88", "0.942"]
     assert "speed_max_rad_s:         \"95 rpm\"" in (rigs / "bench-3.yaml").read_text()
     assert page.evaluate("window.pwned") is None
 
@@ -161,24 +203,39 @@ def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
              "inertia_kg_m2": {**quantity, **estimate(104.0)}, "runs": [{"added_kg_m2": 55.0, "reported_kg_m2": 167.0}],
              "budget": [{"source": HOSTILE, "of_factor": 0.002, "of_inertia": 0.003}]}
     asked = []
-    monkeypatch.setattr(served.service.supervisor, "work",
-                        lambda what, run, more: asked.append(more) or {"document": found})
+    rehearsed = served.service.supervisor.start_run("a", {"note": "done", "fault": ["torque-scale=1.1"]}, "local")
+    served.service.wait(rehearsed.request.id, "done")
     page.goto("/")
     page.get_by_role("link", name="Calibrate").first.click()
     page.wait_for_url("**/calibrate/a")
     page.get_by_label("Run without the body").select_option(run)
+    assert page.locator(f"option[value='{rehearsed.request.id}']").count() == 0
     page.get_by_label("Run with the body").select_option(run)
     page.get_by_label("Inertia of the body").fill("55,0")
+    page.get_by_label("Inertia of the body").fill("much")
+    page.get_by_label("Its standard uncertainty").fill("-1")
     calibrate = page.get_by_role("button", name="Calibrate")
     calibrate.click()
-    page.get_by_text("Choose two different runs.").wait_for()
-    page.get_by_label("Run with the body").select_option(other)
-    page.get_by_label("Inertia of the body").fill("much")
-    calibrate.click()
-    page.get_by_text("as a positive number of kg·m²").wait_for()
+    page.locator("#wrong-with_body", has_text="Choose two different runs.").wait_for()      # each at its field, at once
+    page.locator("#wrong-added_kg_m2", has_text="as a positive number of kg·m²").wait_for()
+    assert {one.get_attribute("name") for one in page.locator("#calibrate [aria-invalid=true]").all()} == {
+        "with_body", "added_kg_m2", "added_sd_kg_m2"}
     assert asked == []
+    page.get_by_label("Run with the body").select_option(other)
+    page.get_by_label("Its standard uncertainty").fill("")
     page.get_by_label("Inertia of the body").fill("55,0")
+    goes_on = threading.Event()
+
+    def slow(what, run, more):
+        goes_on.wait(30.0)
+        asked.append(more)
+        return {"document": found}
+
+    monkeypatch.setattr(served.service.supervisor, "work", slow)
     calibrate.click()
+    page.get_by_text(re.compile(r"^Both logs are identified: \d+ s$")).wait_for()
+    assert page.locator("#said").get_by_role("progressbar").count() == 1
+    goes_on.set()
     page.get_by_text("κ = 0.9550 (0.9454 to 0.9646)").wait_for()
     assert (asked[0]["without"], asked[0]["with_body"], asked[0]["added_kg_m2"]) == (run, other, 55.0)
     with page.expect_download() as download:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from typing import Any
 
 import pytest
 
+from tdhil.service.store import write_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
-from tests.service.chromium.pages import IN_CHROMIUM, Served, begin, results
+from tests.service.chromium.pages import IN_CHROMIUM, Served, begin, judge, results
 from tests.service.conftest import wait_for
 
 pytestmark = IN_CHROMIUM
@@ -25,10 +27,65 @@ def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
     run = begin(served)
     page.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
-    served.service.wait(run, "stopped")
-    page.goto(f"/runs/{run}")
+    page.wait_for_url(f"**/runs/{run}")                # the page becomes the result
     page.get_by_text("stopped, at standstill").wait_for()
+    page.get_by_role("list", name="Stop").get_by_text("drive reacted").wait_for()
     assert page.locator("#result .alarm").count() == 0
+
+
+@pytest.mark.parametrize(("what", "state"), [
+    ("identify", "failed"), ("ask", "refused"), ("brake", "stop_not_confirmed"),
+])
+def test_a_page_becomes_the_result_once_the_shaft_stands_still(page, served, what, state):
+    """Also after a failure and a refusal. If standstill is not confirmed, the live page with its Stop stays."""
+    run = begin(served, what) if what != "identify" else served.service.supervisor.start_run(
+        "a", {"note": what}, "local").request.id
+    folder = served.service.store.place(run)
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text={"identify": "identifying", "ask": "waiting", "brake": "moving"}[what]).wait_for()
+    path = folder / "state.json"
+    stored = json.loads(path.read_bytes())
+    write_json(path, {**stored, "state": state, "history": [*stored["history"], {
+        "state": state, "at": stored["history"][-1]["at"], "stage": None}]})
+    if what == "brake":
+        page.locator("#state", has_text="STOP NOT CONFIRMED").wait_for()
+        page.wait_for_timeout(500)
+        assert page.url.endswith("/live") and page.get_by_role("link", name="To the result").is_visible()
+    else:
+        page.wait_for_url(f"**/runs/{run}")
+    os.kill(stored["pid"], signal.SIGKILL)             # it did not end: only its file says so
+
+
+def test_a_sign_off_without_words_is_refused_at_its_field(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "unseen"}, "local").request.id
+    served.service.wait(run, "stop_not_confirmed")
+    page.goto(f"/runs/{run}")
+    saw = page.get_by_label("What you saw")
+    saw.fill("   ")
+    page.get_by_role("button", name="Sign off").click()
+    page.locator("#sign #wrong-note").wait_for()
+    assert saw.get_attribute("aria-invalid") == "true" and not page.locator("#away").is_visible()
+    saw.fill("at standstill, key out")
+    page.get_by_role("button", name="Sign off").click()
+    page.get_by_text("Signed off by local").wait_for()
+
+
+def test_a_result_shows_j_then_a_picture_then_the_budget_and_its_events_folded(page, served, monkeypatch):
+    run = begin(served)
+    served.service.supervisor.stop(run, "local")
+    served.service.wait(run, "stopped")
+    results(served, run, monkeypatch)
+    judge(served, run)
+    page.goto(f"/runs/{run}")
+    places = [page.locator(one).first for one in (
+        "#result .figure", "#picture figure", "#budget meter", "#accepted table", "#log-events", "#record")]
+    for one in places:
+        one.wait_for()
+    tops = [one.evaluate("one => one.getBoundingClientRect().top + scrollY") for one in places]
+    assert tops == sorted(tops)
+    assert not page.locator("#log-events li").first.is_visible()
+    page.locator("#log-events summary").click()
+    page.locator("#log-events li").first.wait_for()
 
 
 def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
@@ -42,26 +99,25 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     served.service.wait(run, "stopped")
     page.get_by_text("stopped, at standstill").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
-    assert button.is_disabled()
 
 
 def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
-    run = begin(served)
+    run = begin(served, "brake")
     page.goto(f"/runs/{run}/live")
     page.locator("#state", has_text="moving").wait_for()
 
     def late(route: Any) -> None:
         answer = route.fetch()
-        served.service.wait(run, "stopped")
-        page.get_by_text("stopped, at standstill").wait_for()
+        page.locator("#state", has_text="stopping").wait_for()
         route.fulfill(response=answer)
 
     page.route("**/stop", late)
     with page.expect_response("**/stop"):
         page.get_by_role("button", name="Stop", exact=True).click()
     page.wait_for_timeout(300)
-    assert page.get_by_text("stopped, at standstill").is_visible()
-    assert page.get_by_role("button", name="Stop", exact=True).is_disabled()
+    assert page.locator("#state", has_text="stopping").is_visible()
+    (served.service.store.place(run) / "rest").touch()
+    page.get_by_text("stopped, at standstill").wait_for()
 
 
 def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monkeypatch):

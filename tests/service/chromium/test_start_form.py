@@ -35,7 +35,7 @@ def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     assert served.service.store.request(run).options == {"tolerance": 0.025}
     page.get_by_role("link", name="The recorded motion").click()
     page.locator("#readout").wait_for()
-    page.get_by_role("link", name="To the result").wait_for()             # it stays
+    page.get_by_role("link", name="To the result").wait_for()             # the record stays
 
 
 def test_an_error_names_the_field_and_takes_the_old_plan_away(page, served, monkeypatch):
