@@ -20,7 +20,7 @@ CEILINGS = {
     "tdhil/evidence": (1_400, FIRST),
     "tdhil/fleet": (2_100, FIRST),
     "tdhil/recording": (5_400, FIRST),
-    "tdhil/report": (6_800, FIRST),
+    "tdhil/report": (7_000, "0082"),
     "tdhil/runner": (12_000, FIRST),
     "tdhil/service": (11_900, FIRST),
     "tdhil/session": (4_500, FIRST),

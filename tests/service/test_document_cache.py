@@ -21,7 +21,7 @@ def test_a_calibration_is_kept_until_one_of_its_logs_changes(tmp_path):
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "run.mcap").write_bytes(b"1")
-    kept, asked = KeptAnswers(tmp_path), {"without": "one", "with_body": "two", "added_kg_m2": 55.0}
+    kept, asked = DocumentCache(tmp_path), {"without": "one", "with_body": "two", "added_kg_m2": 55.0}
     kept.put(kept.key("calibrate", asked), {"n": 1})
     assert kept.get(kept.key("calibrate", asked)) == {"n": 1}
     assert kept.get(kept.key("calibrate", asked | {"added_kg_m2": 50.0})) is None
