@@ -75,6 +75,7 @@ def test_from_the_login_to_a_run_and_out_again(page, served):
     page.get_by_role("button", name="Stop", exact=True).click()
     served.service.wait(run, "stopped")
     assert served.service.store.request(run).asked_by == served.service.store.status(run).stop.by == "operator"
+    page.wait_for_url(f"**/runs/{run}")                # it becomes the result
     fits(page)
     assert page.get_by_role("link", name="Audit").count() == 0
     page.goto("/")

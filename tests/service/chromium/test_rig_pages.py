@@ -167,7 +167,8 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     page.get_by_role("button", name="Start: preflight, then the code").wait_for()
     page.get_by_role("heading", name="First motion of this rig").wait_for()          # its steps, and a careful plan
     page.get_by_text("The shaft moves for the first time: at most 200 N·m and 3 rad.").wait_for()
-    assert [page.locator(f"[name={name}_rad_s]").input_value() for name in ("offset", "amplitude")] == ["2.88", "0.942"]
+    filled = [page.locator(f"[name={name}_rad_s]").input_value() for name in ("offset", "amplitude")]
+    assert filled == ["27.5", "9"]                     # rpm, as the switch says: 2.88 and 0.942 rad/s
     assert "speed_max_rad_s:         \"95 rpm\"" in (rigs / "bench-3.yaml").read_text()
     assert page.evaluate("window.pwned") is None
 
