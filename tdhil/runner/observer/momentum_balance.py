@@ -12,8 +12,10 @@ from tdhil.runner.observer.shaft_bounds import ShaftBounds
 from tdhil.runner.settings import MachineLimits
 
 SHORT_WINDOWS_S = (0.25, 0.5, 1.0, 2.0)
+"""Windows of (1) in which lags hide more than an error of J, s."""
+
 WINDOWS_S = (*SHORT_WINDOWS_S, 3.0, 4.0)
-"""Windows of (1), s. Short ones detect a jump; long ones detect a report that stops following, or that follows with
+"""All windows of (1), s. Short ones detect a jump; long ones detect a report that stops following, or that follows with
 another scale: the lags hide less of a longer change. A sensor whose scale halves at low speed, in speed mode, is found
 by the window of 3 s (`benchmarks/lying_reports.py`, 2147). On 51 healthy rigs those of 3 and 4 s reach 0.37 of the
 bound once J is known, no more than that of 2 s (`benchmarks/healthy_runs.py`)."""
