@@ -232,11 +232,15 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "studies/paper/loop.py": ("the paper's own motions", {"multisine", "sine"}),
     "studies/paper/sweeps.py": ("the paper's own motions", {"sine"}),
     "service/static/app.js": (
-        "a role, signals of the plots, the key of a sign-off, the clock that a page measures, values in a text", {
-            "drive", "excitation", "mode", "note", "operator", "place", "step", "speed", "torque", "real_time"}),
+        "a role, signals of the plots, the key of a sign-off, the clock that a page measures, values in a text, the two"
+        " fields that a careful first motion fills", {
+            "amplitude_rad_s", "drive", "excitation", "mode", "note", "offset_rad_s", "operator", "place", "step",
+            "speed", "torque", "real_time"}),
     "service/static/results.js": (
-        "a rehearsal's request; keys of answers; a role; a column of the friction table", {
-            "fault", "faults", "log", "model", "note", "operator", "real_time", "speed", "yes"}),
+        "a rehearsal's request; keys of answers; a role; a column of the friction table and of a chart's CSV; the type"
+        " of a value", {
+            "fault", "faults", "frequency_hz", "log", "model", "note", "operator", "real_time", "speed", "string",
+            "yes"}),
     "service/static/letterhead.js": ("the page and the route of the service's own letterhead", {"letterhead"}),
     "service/static/upload.js": (
         "quantities of a trace, a kind of file, a role, keys of a preview", {
