@@ -247,7 +247,7 @@ def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
 
 
 def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, served):
-    run = begin(served)
+    run = begin(served, "brake")               # it brakes on: one that has stopped becomes its result
     page.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     page.reload()
