@@ -8,7 +8,7 @@ real      without the simulator's marker object or registers: what the host then
 import functools
 import sys
 
-from profiles.simulator_marker import MARKER_INDEX
+from profiles.simulator_marker import MARKER_INDEX, MARKER_REGISTER, MARKER_STAGE_REGISTER
 from sim_bus import command
 from sim_bus.canopen import node, simulator
 from sim_bus.modbus import registers
@@ -26,7 +26,14 @@ def be_real() -> None:
         del self.store.object_dictionary[MARKER_INDEX]
 
     node.Cia402Node.__init__ = without_marker
-    registers._marker = lambda stepped: ()  # type: ignore[attr-defined]
+    plain_map = registers.Map.__init__
+
+    def without_registers(self, *arguments, **options):
+        plain_map(self, *arguments, **options)
+        for address in range(MARKER_REGISTER, MARKER_STAGE_REGISTER):
+            self.slots = {key: slot for key, slot in self.slots.items() if key[1] != address}
+
+    registers.Map.__init__ = without_registers      # type: ignore[method-assign]
 
 
 if __name__ == "__main__":
