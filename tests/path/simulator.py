@@ -30,8 +30,8 @@ def be_real() -> None:
 
     def without_registers(self, *arguments, **options):
         plain_map(self, *arguments, **options)
-        for address in range(MARKER_REGISTER, MARKER_STAGE_REGISTER):
-            self.slots = {key: slot for key, slot in self.slots.items() if key[1] != address}
+        marker = range(MARKER_REGISTER, MARKER_STAGE_REGISTER)
+        self.slots = {key: slot for key, slot in self.slots.items() if key[1] not in marker}
 
     registers.Map.__init__ = without_registers      # type: ignore[method-assign]
 

@@ -165,9 +165,8 @@ def run_up_opinion(case: Case, finding: Finding) -> Fitted:
             case.recording, case.samples, lags_s, delay, density, confidence, _reading(case, finding))
     except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
         return ()
-    if fit is None or not fit.half_width < _OPEN * fit.inertia:
+    if fit is None or (own := _own_inertia(fit)) is None:
         return ()
-    own = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
     return ((SecondOpinion("run-up of stage 2", own, _agrees(own, finding, confidence, _CONTRADICTION), ""), fit),)
 
 
@@ -194,6 +193,13 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 "the run", entry=MessageCode.METHODS_CONTRADICT,
             )
     return Refusal("", "")
+
+
+def _own_inertia(fit: MomentumFit) -> Estimate | None:
+    """Return J of a fit with its interval; None if its interval is open."""
+    if not fit.half_width < _OPEN * fit.inertia:
+        return None
+    return Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
 
 
 def _least_scale_change(
@@ -249,9 +255,8 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
         if kind is BalanceKind.COASTING and not any(row.kind is kind for row in found.rows):
             continue
         fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence, reading)
-        if fit is None or not fit.half_width < _OPEN * fit.inertia:
+        if fit is None or (inertia := _own_inertia(fit)) is None:
             continue
-        inertia = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
         opinions.append((SecondOpinion(route, inertia, None, _note(fit, kind, delay)), fit))
     return tuple(opinions)
 
