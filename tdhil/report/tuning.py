@@ -44,6 +44,7 @@ from tdhil.soft_torque import (
     bit_jumps,
     has_light_bit,
     in_squares,
+    longest_integral_time_s,
     reflection_at,
     simulate,
 )
@@ -114,7 +115,12 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
         warnings.append("The friction of the bit falls more steeply with speed than the lowest section damps, so it"
                         f" jumps from speed to speed. The critical speeds may be {100.0 * share:.0f} % too low. Take"
                         " them as lower limits.")
+    longest_s = longest_integral_time_s(tuning.string_modes_hz[0])
     for one in tuning.tuned:
+        if one.controller is not None and search is not None and one.controller.integral_time_s > longest_s:
+            warnings.append(f"{one.kind}: the integral time P/I is longer than {longest_s:.0f} s, eight periods of the "
+                            "string. Stick-slip may then be too slow for the simulation. Take the critical speeds as "
+                            "lower limits.")
         if one.controller is not None:
             over = reflection_at(case.drive, one.controller, string, wide_hz)
             if over.max() > 1.001:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
         SimulationTrace as SimulationTrace,
         critical_speeds as critical_speeds, grid_of as grid_of, lowest_turning as lowest_turning,
         HIGHEST_NOISY_RPM as HIGHEST_NOISY_RPM, NOISY_RESOLUTION as NOISY_RESOLUTION,
-        bit_jumps as bit_jumps, has_light_bit as has_light_bit,
+        bit_jumps as bit_jumps, has_light_bit as has_light_bit, longest_integral_time_s as longest_integral_time_s,
         lowest_turning_with_noise as lowest_turning_with_noise, simulate as simulate,
     )
     from tdhil.soft_torque.recipes import largest_stable_share as largest_stable_share
@@ -92,7 +92,8 @@ else:
         "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
         "uncertainty": "Interval DrawnValues Truth draw_truths independent_axes joint_draws",
         "simulation": "Begin CriticalSpeeds Grid RPM Search SimulationTrace critical_speeds grid_of lowest_turning "
-                      "HIGHEST_NOISY_RPM NOISY_RESOLUTION bit_jumps has_light_bit lowest_turning_with_noise simulate",
+                      "HIGHEST_NOISY_RPM NOISY_RESOLUTION bit_jumps has_light_bit longest_integral_time_s "
+                      "lowest_turning_with_noise simulate",
         "recipes": "largest_stable_share",
         "tune_case": "Advice Moved TUNING_REFUSED TuneCase Tuned Tuning TuningRefused WrongInertia",
         "tuned_figures": "BAND_HZ figures_at in_squares least_damping lowest_modes_below_hz recipe_with "

@@ -1,6 +1,7 @@
 r"""Candidate gains on a grid, ranked by the steepness of the falling bit friction with which they stay stable.
 
-**Grid.** P = ζ/a, I = (φω)² (J − J_c), J_c = share · J. Softness a, frequency factor φ and share are free.
+**Grid.** P = ζ/a, I = (φω)² (J − J_c), J_c = share · J. Softness a, frequency factor φ and share are free. Points
+with an integral time P/I of more than eight periods of the string's lowest mode are left out: no search can judge them.
 
 **Rank.** At the lowest mode, the bit is loaded by Re Z_b (`stability`). A bit that oscillates with amplitude A about
 its mean speed Ω takes in as much energy as a friction slope of −σ_e, with σ_e = −(2/A) mean(T_f(Ω + A sin φ) sin φ)
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, impedance
 from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
+from tdhil.soft_torque.simulation import longest_integral_time_s
 from tdhil.soft_torque.stability import bit_grid, bit_impedance, chain_of, linear_limit_rad_s, steepest_slope
 from tdhil.soft_torque.uncertainty import Truth
 
@@ -52,11 +54,13 @@ def candidates(
     string: DrillString, inertia_kg_m2: float, mode_hz: float, shares: Sequence[float],
     softnesses: Sequence[float] = SOFTNESSES, factors: Sequence[float] = FREQUENCY_FACTORS,
 ) -> list[Candidate]:
-    """Return the controllers at all points of the grid."""
-    return [
+    """Return the controllers at all points of the grid whose integral time is short enough for a search under noise."""
+    longest_s = longest_integral_time_s(mode_hz)
+    grid = [
         Candidate(softness, factor, share, gains(string, inertia_kg_m2, mode_hz, softness, factor, share))
         for share in shares for factor in factors for softness in softnesses
     ]
+    return [one for one in grid if one.controller.integral_time_s <= longest_s]
 
 
 def gains(

@@ -24,7 +24,7 @@ into slow oscillations.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import atan, atan2, pi, sqrt
+from math import atan, atan2, inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,11 @@ class SpeedController:
     compensated_kg_m2: float = 0.0
     """Compensated inertia J_c."""
     derivative_filter_s: float = DERIVATIVE_FILTER_S
+
+    @property
+    def integral_time_s(self) -> float:
+        """Return the integral time Tn = P/I, s; infinite without integral action."""
+        return self.gain_nm_s_rad / self.integral_nm_rad if self.integral_nm_rad > 0.0 else inf
 
     def at_shaft(self, ratio: float) -> SpeedController:
         """Return the gains at a shaft that turns ``ratio`` times as fast: all are divided by ratio²."""

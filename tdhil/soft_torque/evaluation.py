@@ -15,8 +15,16 @@ from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.disturbed_cure import TRIALS, DisturbedTrials, disturbed_trials
 from tdhil.soft_torque.drill_string import DrillString, StringTolerance
-from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
-from tdhil.soft_torque.tuned_figures import lowest_modes_below_hz
+from tdhil.soft_torque.simulation import (
+    CALM_INTEGRAL_TIMES,
+    LONGEST_TICK_S,
+    RPM,
+    Array,
+    Begin,
+    longest_integral_time_s,
+    simulate,
+)
+from tdhil.soft_torque.tuned_figures import lowest_modes_below_hz, string_modes_hz
 from tdhil.soft_torque.uncertainty import Interval
 from tdhil.soft_torque.virtual_string import COLUMNS, IdentifiedRig, Phase, SpeedProgram
 
@@ -192,7 +200,10 @@ def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
             next_step="Raise it, if machine and drive allow, or take a softer controller (--use)")
     # Torque that moves the intended rotor, including the first second, in which the bit breaks away.
     moving_nm = case.meant.inertia_kg_m2 * float(np.abs(rate).max()) / ratio
-    program = SpeedProgram(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
+    slow_s = min(case.law.integral_time_s, longest_integral_time_s(string_modes_hz(case.string)[0]))
+    calm_s = max(SpeedProgram.calm_s, CALM_INTEGRAL_TIMES * slow_s)      # as in the prediction
+    program = SpeedProgram(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm, calm_s=calm_s,
+                           trial_s=max(SpeedProgram.trial_s, 2.0 * calm_s))
     if case.own_loop:      # the drive's own loop has to balance the string's torque itself
         program = replace(program, fade_s=OWN_LOOP_FADE_S, armed_s=OWN_LOOP_ARMED_S, settle_s=OWN_LOOP_ARMED_S)
     return program

@@ -25,6 +25,7 @@ from tdhil.soft_torque.controller import (
     tuned_controller,
 )
 from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M
+from tdhil.soft_torque.simulation import longest_integral_time_s
 from tdhil.soft_torque.stability import (
     is_stable,
 )
@@ -81,7 +82,7 @@ def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[T
     kept = _within_margins(case, grid, samples)
     if not kept:
         tried = tuned_controller(case.string, case.drive.inertia_kg_m2, asked or 0.3, held[0])
-        words = _no_margin(case, samples, tried)
+        words = _no_margin(case, held, samples, tried)
         if asked is not None:
             raise TuningRefused(f"a = {asked:g} leaves too little margin: {words}", where=f"--a {asked:g}",
                                 next_step="Ask for another a, leave --a out, or find a shorter loop")
@@ -117,7 +118,7 @@ def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) ->
     if not kept:
         share = asked if asked is not None else SHARES[0]
         tried = tuned_controller(case.string, case.drive.inertia_kg_m2, case.softness or 0.3, held[0], share)
-        words = _no_margin(case, samples, tried)
+        words = _no_margin(case, held, samples, tried)
         if asked is not None:
             raise TuningRefused(
                 f"{100 * asked:.0f} % of J compensated leaves too little margin: {words}",
@@ -145,11 +146,19 @@ def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: TruthMar
     return kept
 
 
-def _no_margin(case: TuneCase, samples: TruthMargins, law: SpeedController) -> str:
+def _no_margin(case: TuneCase, held: Sequence[float], samples: TruthMargins, law: SpeedController) -> str:
     """Return the text that names the failed margins, each with its least value over all truths."""
-    worst = samples.every(law)
-    return ", ".join(case.required.failed(worst) or ("too soft for these lags",)) + (
+    failed = (*case.required.failed(samples.every(law)), *_too_slow(law, held))
+    return ", ".join(failed or ("too soft for these lags",)) + (
         f" over J's interval, string, bit and {_lag_ms(case)} of lag{_no_drag(case)}")
+
+
+def _too_slow(law: SpeedController, held: Sequence[float]) -> tuple[str, ...]:
+    """Return the text that the integral time is longer than a search can judge, if it is."""
+    longest_s = longest_integral_time_s(held[0])
+    if law.integral_time_s <= longest_s:
+        return ()
+    return (f"integral time {law.integral_time_s:.0f} s (limit {longest_s:.0f} s, eight periods of the string)",)
 
 
 def _no_drag(case: TuneCase) -> str:
@@ -188,7 +197,7 @@ def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> T
         return Tuned("broadband", None, words, largest_share=here)
     softness = round(float(softness), 3)
     law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
-    thin = case.required.failed(samples.every(law))
+    thin = (*case.required.failed(samples.every(law)), *_too_slow(law, held))
     if thin:
         return Tuned("broadband", None, f"it would leave too little margin: {', '.join(thin)}", largest_share=here)
     softest = softest_allowed(case.string, case.drive, held[0], share)

@@ -19,8 +19,10 @@ def lowest_turning_of_chain(
 ):
     """Return for each law (P, I, J_c, filter) the lowest set speed, rpm, at and above which a stuck bit comes free.
 
-    Infinite: none.
+    Infinite: none. A simulation lasts for 12 periods or 12 of the longest integral time P/I, and the bit must turn in
+    its last quarter.
     """
+    periods = 12.0 * max(1.0, *(gain / integral / period_s for gain, integral, _, _ in laws))
     speeds = np.geomspace(lowest, highest, coarse)
 
     def turns(rpm):
@@ -29,7 +31,7 @@ def lowest_turning_of_chain(
             bottom_inertia=bottom_inertia, bottom_viscous=bottom_viscous, coulomb_nm=coulomb_nm, static_nm=static_nm,
             stribeck_rad_s=stribeck_rad_s, noise_nm=noise_nm, noise_correlation_s=noise_correlation_s,
             inertia=inertia, viscous=viscous, dry_nm=dry_nm, lags_s=lags_s, laws=laws, seed=seed, rpm=rpm,
-            period_s=period_s, lumps=lumps, wall_nm=wall_nm, collars=collars)
+            period_s=period_s, lumps=lumps, wall_nm=wall_nm, collars=collars, periods=periods, calm=0.25 * periods)
 
     def first(row):
         sticking = np.flatnonzero(~row)

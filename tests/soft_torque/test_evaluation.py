@@ -222,6 +222,15 @@ def test_the_torque_of_the_highest_set_speed_counts_before_motion():
 
 
 @pytest.mark.heavy
+def test_trials_are_long_enough_for_slow_stick_slip():
+    """A trial of a loop with a long integral time lasts as long as the simulation of the prediction requires."""
+    assert program_for(CASE, WINDOW).calm_s == SpeedProgram.calm_s
+    program = program_for(replace(CASE, law=SpeedController(1600.0, 80.0)), replace(WINDOW, torque_nm=1e5))
+    assert program.calm_s == pytest.approx(3.0 * 1600.0 / 80.0)
+    assert program.trial_s == pytest.approx(2.0 * program.calm_s)
+
+
+@pytest.mark.heavy
 def test_the_unknown_torque_widens_the_predicted_critical_speed():
     """A bench of 32 kg·m²: disturbances of 106 N·m rms at the main shaft let the bit turn from 39 rpm on, at times."""
     law = SpeedController(738.3, 638.5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -26,6 +28,7 @@ from tdhil.soft_torque import (
     critical_speeds,
     grid_of,
     has_light_bit,
+    linear_limit,
     lowest_turning,
     lowest_turning_with_noise,
     reflection_at,
@@ -227,6 +230,42 @@ def test_grid_and_report_have_one_rule_for_a_light_bit(outer_m, inertia_kg_m2, l
     assert one["critical_rpm"]["cure"]["high"] == pytest.approx(75.0 + 0.5 + share * 75.0)
 
 
+LIGHT = TopDrive(104.2, 8.0, 60.0, DRIVE.inner_lags_s)
+SLOW = SpeedController(372.8, 15.63, 10.42)
+"""Its integral time is 24 s, three periods of the string."""
+
+
+def test_a_bit_that_sticks_again_after_a_minute_does_not_turn():
+    """A slow stick-slip cycle is simulated to its end: the cure speed is the linear stability limit."""
+    search = Search(lowest_rpm=0.0, highest_rpm=48.0)
+    (found,) = lowest_turning(STRING, [(LIGHT, SLOW)], "stuck", search)
+    assert found == pytest.approx(linear_limit(STRING, LIGHT, SLOW) / RPM, abs=1.5)
+
+
+@pytest.mark.heavy
+def test_slow_stick_slip_against_the_chain():
+    """With and without noise, the cure speed of a loop with a long integral time is that of the chain of masses."""
+    for noise_nm in (0.0, 200.0):
+        string = replace(STRING, bit=replace(STRING.bit, noise_nm=noise_nm))
+        (found,) = lowest_turning_with_noise([string], [(LIGHT, SLOW)], [1], "stuck", 7.7)
+        (expected,) = lowest_turning_of_chain(
+            laws=[(SLOW.gain_nm_s_rad, SLOW.integral_nm_rad, SLOW.compensated_kg_m2, 0.05)],
+            **{key: value for key, value in reference_case(noise_nm=noise_nm, inertia=104.2).items() if key != "laws"})
+        assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_gains_whose_stick_slip_may_be_too_slow_are_told():
+    """Beyond eight periods of the string, the critical speeds may be too low: present gains without integral action."""
+    shown = {}
+    for integral in (1600.0 / 60.0, 1600.0 / 63.0, 0.0):
+        present = Tuned("present", SpeedController(1600.0, integral), reflection=J, band_reflection=J, damping=J,
+                        margins=Margins(60.0, 10.0, 0.5), quiet_cures=(75.0,) * 5)
+        tuning = Tuning(TuneCase(STRING, DRIVE, J), (0.13,), (present,), Search(), Advice(None, "present", keep=True))
+        document = tuning_document(tuning, TunedFor("x", True, None, 1.0, "drive", "stated"))
+        shown[integral] = [words for words in document["warnings"] if "longer than 62 s" in words]
+    assert [len(words) for words in shown.values()] == [0, 1, 1]
+
+
 @pytest.mark.parametrize(("outer_m", "jumps"), [(0.2032, False), (0.127, True)])
 def test_a_bit_without_inertia_is_in_balance_and_jumps_only_where_its_branch_ends(outer_m, jumps):
     """Torque rises and falls slowly: friction and damping balance it. On falling friction, the bit shows hysteresis."""
@@ -304,8 +343,6 @@ def test_steady_rotation_stays_steady():
 @pytest.mark.heavy
 def test_dry_friction_along_the_string_against_the_chain():
     """In a deviated well with 1,500 N·m of dry wall friction, cure speeds agree with the chain of masses to 5 %."""
-    from dataclasses import replace
-
     line = replace(STRING.lines[0], coulomb_nm_m=0.5, static_nm_m=0.5)
     string = replace(STRING, lines=(line,), bit=replace(STRING.bit, noise_nm=0.0))
     laws = (SOFT_025, HALF)

@@ -44,6 +44,14 @@ def tuned():
     return {one.kind: one for one in tune(case(), search=None).tuned}
 
 
+def test_gains_that_no_search_can_judge_are_not_offered():
+    """On a very light top drive, every grid point has an integral time of more than eight periods of the string."""
+    found = {one.kind: one for one in tune(case(Interval(1.5, 1.45, 1.55)), search=None).tuned}
+    for kind in ("soft", "compensated"):
+        assert found[kind].controller is None
+        assert "integral time" in found[kind].refusal and "eight periods of the string" in found[kind].refusal
+
+
 @pytest.mark.heavy
 def test_what_is_chosen_ranks_best_of_all_that_keep_the_margins(tuned):
     """No gains of a finer grid that keep every margin on every truth have an estimated critical speed 5 % lower."""
