@@ -170,8 +170,10 @@ def _noise_words(one: Part) -> str:
     if found is None:
         return f"not known: {one['bit_noise_refused']}"
     time_s = found["correlation_s"]
-    measured = "" if found["correlation_measured"] else ", as stated"
-    return f"{_with(found['rms_nm'], 0, ' N·m')} rms, correlation time {time_s['value']:.2f} s{measured}"
+    rms = f"{_with(found['rms_nm'], 0, ' N·m')} rms"
+    if found["correlation_measured"]:
+        return f"{rms}, correlation time {time_s['value']:.2f} s"
+    return f"{rms}, if its correlation time is {time_s['value']:.2f} s as stated: the record does not determine it"
 
 
 def _reflection(one: Part) -> str:

@@ -16,6 +16,10 @@ a known part of the spectrum of n.
 **Fit.** n is a first-order Gauss–Markov process: its density is 4σ²θ/(1 + (Ωθ)²). σ, and θ where the record shows it,
 maximise Whittle's likelihood of the averaged spectrum (Hann windows with half overlap) in the band of the string's
 lowest modes. The interval is the root of the sum of squares of the scatter, J, and the string's tolerances.
+
+**Held correlation time.** If the record does not show θ, it is held at the stated value. The record then determines the
+density at the string's lowest mode, which excites stick-slip. σ is that of a noise with the held θ and this density.
+Its interval contains the fits with a much shorter θ and with twice the θ, converted in the same way.
 """
 
 from __future__ import annotations
@@ -62,8 +66,12 @@ MOST_MISFIT = 6.0
 or J. Values above 1 widen the interval."""
 MOST_SPREAD = 2.5
 """Largest ratio of the ends of the interval to its value. A wider one is refused."""
-MOST_CORRELATION_SPREAD = 3.0
-"""Largest ratio of the ends of the interval of θ to its value. A wider θ is held at the stated value."""
+MOST_CORRELATION_SPREAD = 1.6
+"""Largest ratio of the ends of the interval of θ to its value. A wider θ is held at the stated value. With 3, a θ of
+0.1 s was taken only from records whose scatter made it look longer: 0.20 to 0.29 s in 5 of 12."""
+HELD_FACTORS = 0.01, 2.0
+"""Ends of θ, as multiples of a held one, for the interval of σ: white in the band; and the longest one that a record of
+600 s on the reference string does not show."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,8 @@ class BitNoiseEstimate:
     """Random torque of the bit in one record."""
 
     rms_nm: Interval
-    """Root mean square, N·m."""
+    """Root mean square, N·m. If the correlation time is held: that of a noise with the stated correlation time and the
+    same density at the string's lowest mode."""
     correlation_s: Interval
     """Correlation time, s. If its ends are equal, it is the stated value."""
     band_hz: tuple[float, float]
@@ -121,6 +130,13 @@ def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) 
     moved = [[_fitted(spectra, string, end, record, held_s).rms for end in (inertia.low, inertia.high)]]
     moved += [[_fitted(spectra, end, inertia.value, record, held_s).rms for end in pair]
               for pair in (*string_ends(string), *_bit_ends(string))]
+    if value.correlation_log_sd == 0.0:      # θ is held
+        lowest_rad_s = np.array(2.0 * pi * string_modes_hz(string)[0])
+        shorter, longer = (_fitted(spectra, string, inertia.value, record, factor * held_s, hold=True)
+                           for factor in HELD_FACTORS)
+        unit = _density(held_s, lowest_rad_s)
+        moved.append([other.rms * sqrt(_density(other.correlation_s, lowest_rad_s) / unit)
+                      for other in (shorter, longer)])
     wider = COVERAGE_K * value.log_sd * sqrt(max(1.0, value.misfit))
     rms = in_squares(Interval(value.rms, value.rms * exp(-wider), value.rms * exp(wider)), moved)
     if rms.low <= 0.0 or rms.high / value.rms > MOST_SPREAD or value.rms / rms.low > MOST_SPREAD:
@@ -204,10 +220,17 @@ class _FittedNoise:
     misfit: float
 
 
+def _density(correlation_s: float, omega: Array) -> Array:
+    """Return the one-sided density of a Gauss–Markov process of unit variance, 1/Hz."""
+    found: Array = 4.0 * correlation_s / (1.0 + (omega * correlation_s) ** 2)
+    return found
+
+
 def _fitted(
-    spectra: _ReportSpectra, string: DrillString, inertia: float, record: SurfaceRecord, held_s: float
+    spectra: _ReportSpectra, string: DrillString, inertia: float, record: SurfaceRecord, held_s: float,
+    *, hold: bool = False,
 ) -> _FittedNoise:
-    """Return the best σ, and θ if the spectrum determines it; else θ is ``held_s``."""
+    """Return the best σ, and θ if the spectrum determines it; else, or with ``hold``, θ is ``held_s``."""
     from scipy.optimize import minimize
 
     omega = 2.0 * pi * spectra.hertz
@@ -233,7 +256,7 @@ def _fitted(
     excess = max(float(np.mean(seen - reports)), 1e-6 * float(np.mean(seen)))
 
     def density(parts: Array) -> Array:
-        found: Array = 4.0 * np.exp(2.0 * parts[0] + parts[1]) / (1.0 + (omega * np.exp(parts[1])) ** 2)
+        found: Array = np.exp(2.0 * parts[0]) * _density(float(np.exp(parts[1])), omega)
         return found
 
     def whittle(parts: Array) -> float:
@@ -253,7 +276,7 @@ def _fitted(
     bounds = [(start(held_s) - 5.0, start(held_s) + 5.0), (log(held_s) - 4.0, log(held_s) + 4.0)]
     best = minimize(whittle, [start(held_s), log(held_s)], method="L-BFGS-B", bounds=bounds).x
     spread = np.linalg.pinv(information(best))
-    if COVERAGE_K * sqrt(max(0.0, spread[1, 1])) > log(MOST_CORRELATION_SPREAD) or not (
+    if hold or COVERAGE_K * sqrt(max(0.0, spread[1, 1])) > log(MOST_CORRELATION_SPREAD) or not (
             bounds[1][0] < best[1] < bounds[1][1]):
         bounds[1] = (log(held_s), log(held_s))
         best = minimize(whittle, [start(held_s), log(held_s)], method="L-BFGS-B", bounds=bounds).x
