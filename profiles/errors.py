@@ -20,8 +20,8 @@ class TdhilError(Exception):
     """Root of all errors that a user can cause or meet.
 
     ``what`` happened, ``where`` (file:line, object, register, stage), and ``next_step``, the remedy. Texts name options
-    by their flags; ``spelling`` maps a flag to its name in another interface (API, Python). ``entry``: the entry of the
-    table of messages; without it, that of the class.
+    by their flags. ``spelling`` maps a flag to its keyword in Python; the service's pages show the label of its field.
+    ``entry``: the entry of the table of messages; without it, that of the class.
     """
 
     spelling: Mapping[str, str] = MappingProxyType({})

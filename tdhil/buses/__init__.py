@@ -6,7 +6,7 @@
 from tdhil.buses.bus import (
     Bus as Bus, Connection as Connection, FoundDrive as FoundDrive, Line as Line, Opening as Opening,
     PeerPlan as PeerPlan, ProfileTable as ProfileTable, ValueSeen as ValueSeen, all_buses as all_buses,
-    bus_named as bus_named, examples as examples,
+    bus_named as bus_named, examples as examples, keys_by_flag as keys_by_flag,
 )
 from tdhil.buses.doctor_finding import (
     DoctorFinding as DoctorFinding, bad as bad, note as note, of_error as of_error, ok as ok,

@@ -292,6 +292,12 @@ def all_buses() -> tuple[Bus, ...]:
     return tuple(bus_named(name) for name in BUSES)
 
 
+def keys_by_flag() -> dict[str, str]:
+    """Return the key of rig.yaml for each option of a bus. Short flags of python-can have the key without a section."""
+    keys = {flag: f"{bus.section}.{name}" for bus in all_buses() for name, flag in bus.flags.items()}
+    return {"-i": "interface", "-c": "channel", "-b": "bitrate", **keys}
+
+
 def examples() -> str:
     """Return the options that name a drive on each bus, as examples to type."""
     *first, last = (one for bus in all_buses() for one in bus.examples)

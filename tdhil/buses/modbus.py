@@ -544,9 +544,10 @@ def scan_lines(
             next_step="Check baud rate and parity at the drive, the polarity of the wires, termination and shielding",
             entry=MessageCode.BAD_REPLY,
         )
-    step = "Check the drive's unit number (--units 1-247 scans all), that Modbus TCP is on, and its address"
+    more = "that Modbus TCP is on, and its address"
     if line_of(connection).serial is not None:
-        step = "Check the drive's unit number (--units 1-247 scans all), baud rate, the two wires and their polarity"
+        more = "baud rate, the two wires and their polarity"
+    step = f"Check the drive's unit number (tdhil scan --units 1-247 scans all), {more}"
     raise CommunicationLost(f"no unit answers ({asked})", where=where, next_step=step, entry=MessageCode.NO_REPLY)
 
 

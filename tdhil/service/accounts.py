@@ -225,7 +225,7 @@ class AccountsFile:
             descriptor = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise LogError(f"can't be written ({error.strerror or error})", where=str(self.path.parent),
-                           next_step="Name the service's folder with --data") from error
+                           next_step="Check the folder of the service") from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             yield self.read()

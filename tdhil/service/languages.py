@@ -18,6 +18,8 @@ from typing import Any, Final
 from markupsafe import Markup, escape
 from starlette.requests import HTTPConnection
 
+from tdhil.buses import keys_by_flag
+from tdhil.config import OF_A_TRACE, OF_EVIDENCE, OPTIONS
 from tdhil.errors import MessageCode
 
 FOLDER: Final = Path(__file__).with_name("catalogues")
@@ -57,10 +59,24 @@ class Language:
         """Return a number of a page. Below 1000 it has four digits at most."""
         return f"{float(f'{value:.4g}') if abs(value) < 1000.0 else value:g}".replace(".", self.decimal)
 
+    def labels(self) -> dict[str, str]:
+        """Return how a page names each option of the command line, by its flag.
+
+        It is the label of its field, else its key in the rig's file, else the command for a terminal.
+        """
+        in_file = self.word("{value} (rig's file)")
+        names = {flag: in_file.replace("{value}", f"“{key}”") for flag, key in keys_by_flag().items()}
+        for command, options in (("evidence", OF_EVIDENCE), ("replay", OF_A_TRACE), ("identify", OPTIONS)):
+            for one in options:
+                other = in_file.replace("{value}", f"“{one.at}”") if one.at else f"“tdhil {command} {one.flag}”"
+                names[one.flag] = f"“{self.word(one.label)}”" if one.label else other
+        return names
+
     def script(self) -> str:
-        """Return the texts, and the titles of the message codes, as a script for the pages. It contains only ASCII."""
-        titles = {one.code: self.word(one.title, one.code) for one in MessageCode}
-        return f"window.tdhilTexts = {json.dumps(dict(self.texts))};\nwindow.tdhilTitles = {json.dumps(titles)};\n"
+        """Return the texts, the titles of the message codes and the labels of options as a script, in ASCII."""
+        titles = {one.code: self.word(one.title, one.code) for one in MessageCode if self.texts}
+        known = {"Texts": dict(self.texts), "Titles": titles, "Labels": self.labels()}
+        return "".join(f"window.tdhil{name} = {json.dumps(found)};\n" for name, found in known.items())
 
 
 def entries(text: str) -> list[dict[str, str]]:

@@ -379,7 +379,8 @@ def require_faults(texts: Sequence[str], drive: str) -> None:
         if texts:
             bus_named(drive).parse_faults(texts)
     except TdhilError as error:
-        raise ValuesWrong([("fault", f"{error.what}. {error.next_step}")]) from None
+        step = error.next_step.replace("; --f", ". --f").replace("--fault list shows", "The page Rehearse lists")
+        raise ValuesWrong([("fault", f"{error.what}. {step}")]) from None
 
 
 def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None = None) -> RunRequest:

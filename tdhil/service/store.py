@@ -163,7 +163,7 @@ class Store:
                 path.mkdir(parents=True, exist_ok=True, mode=0o750)
         except OSError as error:
             raise LogUnopened(f"can't be made ({error.strerror or error})", where=str(self.folder),
-                              next_step="Name a folder for the runs with --data") from error
+                              next_step="Name another folder for the runs: tdhil serve --data DIR") from error
 
     def new_id(self) -> str:
         """Return a new id, and make its folder. Ids sort by the time they were made at, also within a second.

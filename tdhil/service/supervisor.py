@@ -282,7 +282,7 @@ class Supervisor:
             if run:
                 shutil.rmtree(self.store.runs / run, ignore_errors=True)
             what = f"the run's request can't be written ({error.strerror or error})"
-            where = f"--data {self.store.folder}"
+            where = str(self.store.folder)
             if error.errno in FULL:
                 raise NoRoom(what, where=where, next_step="Nothing was started. Free some disk space") from error
             raise LogError(what, where=where, next_step="Nothing was started. Check that folder") from error
@@ -529,7 +529,7 @@ class Supervisor:
             raise Conflict("this rig exists already", where=f"rig {rig_id}", next_step="Choose another id") from None
         except OSError as error:
             raise LogError(f"the rig's file can't be written ({error.strerror or error})", where=path.name,
-                           next_step="Check the folder of --rigs") from error
+                           next_step="Check the folder of rig files") from error
         found = self.rigs.get(rig_id)
         self.note(who, "rig added", None, rig_id, after=found.sha256)
         return found

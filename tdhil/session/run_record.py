@@ -117,10 +117,6 @@ class RunRecord:
         return {name: getattr(self.recording, name) for name in _UNITS}
 
 
-_KEYWORDS = {"-i": "interface", "-c": "channel", "-b": "bitrate"}
-"""Python keywords of the short flags of python-can, which are outside the table of options."""
-
-
 class ByKeyword(ContextDecorator):
     """Make errors name options by their Python keywords. Use it as a decorator or as a context."""
 
@@ -129,12 +125,11 @@ class ByKeyword(ContextDecorator):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, TdhilError):
-            from tdhil.buses import all_buses
+            from tdhil.buses import keys_by_flag
             from tdhil.config import OF_A_TRACE, OPTIONS
 
-            of_buses = {flag: name for bus in all_buses() for name, flag in bus.flags.items()}
-            own = {option.flag: option.keyword for option in (*OF_A_TRACE, *OPTIONS)}
-            error.spelling = {**of_buses, **own, **_KEYWORDS}
+            of_buses = {flag: key.rpartition(".")[2] for flag, key in keys_by_flag().items()}
+            error.spelling = of_buses | {option.flag: option.keyword for option in (*OF_A_TRACE, *OPTIONS)}
 
 
 @ByKeyword()

@@ -562,7 +562,7 @@ def test_at_this_computer_everybody_may_until_there_are_users(service):
         assert code("POST", "/rigs/a/stop", json={}) == 200
         refused = client.post(f"{API}/rigs/a/runs", json={})
         assert refused.status_code == 403
-        assert "start tdhil serve again" in refused.json()["error"]["next_step"]
+        assert "Start the service again: tdhil serve" in refused.json()["error"]["next_step"]
 
 
 @pytest.mark.heavy

@@ -1,7 +1,7 @@
 // The pages of tdhil serve. Data from elsewhere are inserted as text, never as markup.
 "use strict";
 (() => {
-  const { english, errorText, fixed, local, point, precise, tick, tr, word, worded } = window.tdhilLanguage;
+  const { byLabels, english, errorText, fixed, local, point, precise, tick, tr, word, worded } = window.tdhilLanguage;
   const API = "/api/v1";
   const SILENT_MS = 2000;      // without an answer in this time, a stop counts as not delivered and values as old
   const UNDELIVERED = tr("NOT DELIVERED: use the hard-wired stop");
@@ -238,7 +238,7 @@
       const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, Number(document.body.dataset.stopS) * 1000 + 10000);      // a stop of the drive is answered after standstill
       if (byId("away").textContent.includes(UNDELIVERED)) away("");
       if (found.runs.length && !found.said) location.assign(`/runs/${found.runs[0]}/live`);
-      else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired stop")}`}`);
+      else away(`${rig.name}: ${byLabels(found.said)}${found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired stop")}`}`);
     } catch (error) {
       away(`${tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })}${error instanceof Refused ? `. ${error.message}` : ""}`);
     } finally {
@@ -293,10 +293,9 @@
     for (let closed = field.closest("details"); closed; closed = closed.parentElement.closest("details")) closed.open = true;
   }
   const focus = (field) => (field.querySelector("input") || field).focus();
-  /** Return a message with the labels of this form in place of the command line's options. Mark these fields: the text `said` describes them. */
-  function byLabels(form, message, said, go = true) {
-    const flag = (one) => new RegExp(`(^|[^\\w-])${one.dataset.flag}(?![\\w-])`, "g");
-    const mine = [...form.querySelectorAll("[data-flag]")].filter((one) => flag(one).test(message));
+  /** Return a message, and mark the fields of this form whose labels it quotes: the text `said` describes them. */
+  function marked(form, message, said, go = true) {
+    const mine = [...form.querySelectorAll("[data-flag]")].filter((one) => message.includes(`“${one.dataset.label}”`));
     const fields = mine.map((one) => (one.name ? one : one.querySelector("[name]")));
     fields.forEach((one) => {
       one.setAttribute("aria-invalid", "true");
@@ -304,12 +303,12 @@
       opens(one);
     });
     if (fields.length && go) focus(fields[0]);
-    return mine.reduce((text, one) => text.replaceAll(flag(one), `$1“${one.dataset.label}”`), message);
+    return message;
   }
   /** Show a refusal, all at once: each wrong field of the form is marked with its reason, and the text `said` has the others. */
   function refused(form, said, error, go = true) {
     const fields = error.fields || [], others = fields.filter((one) => !form.elements[one.option]);
-    if (others.length || !fields.length) tell(said, new Refused(fields.length ? others.map((one) => `${word(one.label)}: ${worded(one.message)}`).join("; ") : byLabels(form, whyOf(error), said, go)));
+    if (others.length || !fields.length) tell(said, new Refused(fields.length ? others.map((one) => `${word(one.label)}: ${worded(one.message)}`).join("; ") : marked(form, whyOf(error), said, go)));
     markWrong(form, fields, go);
   }
   function unmark(form) {
@@ -433,7 +432,7 @@
     const paced = pacing(rig, form);
     if (byId("first") && new URLSearchParams(location.search).get("first") === "true") firstMotion(form, byId("first"));
     let key = null, keyFor = "";
-    /** Say an error with the labels of this form in place of the command line's options, and mark these fields. */
+    /** Say an error, and mark the fields that it names. */
     function refuse(message, fields = []) {
       byId("plan").hidden = true;            // the plan of other values
       if (fields.length) {
@@ -442,7 +441,7 @@
         markWrong(form, fields);
         return;
       }
-      show(byId("said"), el("p", { class: "alarm", role: "alert" }, byLabels(form, message, byId("said"))));
+      show(byId("said"), el("p", { class: "alarm", role: "alert" }, marked(form, message, byId("said"))));
     }
     every(3000, async () => {
       const found = await call("GET", `/rigs/${encodeURIComponent(rig)}`);
@@ -581,7 +580,7 @@
       if (known) words.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
       if (last.p_value !== null) words.push(`p = ${number(last.p_value, 2)}`);
       if (last.tolerance !== null && last.least_left_s !== null) words.push(tr("at least {time} to ±{share} %", { time: span(last.least_left_s), share: local(String(Number((100 * last.tolerance).toPrecision(3)))) }));
-      if (last.inertia_kg_m2 === null) words.push(last.reason);
+      if (last.inertia_kg_m2 === null) words.push(byLabels(last.reason));
       byId("inertia-said").textContent = words.join(", ");
       byId("inertia-row").hidden = false;
       if (!known) return;
@@ -656,7 +655,7 @@
         checklist(status.confirmation.text);
         const marks = { ok: "✓", note: "i" }, half = status.expected_half_width, whole = Object.values(status.expected_s).reduce((sum, one) => sum + one, 0);
         byId("confirm-expected").textContent = `${half ? tr("Expected: J to {share}, about {time}.", { share: percent(half), time: span(whole) }) : tr("Expected: about {time}.", { time: span(whole) })} ${tr("{drive}; if the host fails: {action}", { drive: status.identity, action: status.safe_action })}.`;
-        show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), el("td", {}, one.wanted), el("td", {}, one.found), el("td", {}, one.where))));
+        show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), ...[one.wanted, one.found, one.where].map((text) => el("td", {}, byLabels(text))))));
       }
       stopTimes();
       watching();
@@ -904,7 +903,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, byLabels, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

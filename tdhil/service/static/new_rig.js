@@ -1,7 +1,7 @@
 // A new rig in six steps: profile, address with a scan, settings by hand, machine limits with their picture, check, save.
 "use strict";
 (() => {
-  const { english, local, point, tr, word, worded } = window.tdhilLanguage;
+  const { byLabels, english, local, point, tr, word, worded } = window.tdhilLanguage;
   const { byId, call, closes, el, inSpeedUnit, markWrong, onSpeedUnit, pages, show, speedUnit, unmark, waiting, whyOf } = window.tdhil;
   const SCAN_MS = 130000;            // the service ends a scan after 120 s
   const KEPT = "tdhil-new-rig";      // what was typed, until the rig is saved or the tab is closed
@@ -134,7 +134,7 @@
       const marked = markWrong(form, named);
       for (const one of named.filter((each) => !form.elements[each.option])) {
         const place = form.querySelector(`[data-field="${CSS.escape(one.option)}"]`);
-        if (!place) { rest.push(one.message); continue; }
+        if (!place) { rest.push(byLabels(one.message)); continue; }
         place.append(el("span", { class: "alarm wrong" }, worded(one.message)));
         if (!marked) place.scrollIntoView({ block: "center" });
       }

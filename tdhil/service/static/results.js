@@ -1,7 +1,7 @@
 // Results: one run, a comparison, a rig over time, many logs. As in app.js, data from elsewhere are inserted as text.
 "use strict";
 (() => {
-  const { coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
+  const { byLabels, coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
   const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, show, span, speedUnit, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
@@ -103,7 +103,7 @@
     const bars = ((result && result.budget) || []).length > 0;             // the page has its own bars of the budget
     const [first = [], ...others] = found.filter((one) => !bars || one.heading !== byId("budget").dataset.heading).map((one) => [
       el("h2", {}, word(one.heading)),
-      el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" })), el("figcaption", {}, english(one.caption)))]);
+      el("figure", {}, region(tr("{title}, picture", { title: word(one.heading) }), el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: byLabels(one.caption), loading: "lazy" })), el("figcaption", {}, english(one.caption)))]);
     show(byId("picture"), ...first);
     show(byId("pictures"), ...others.flat());
     const curve = (result && result.friction_curve) || [];

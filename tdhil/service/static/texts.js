@@ -3,7 +3,7 @@
 (() => {
   const LANGUAGE = document.documentElement.lang, BETWEEN = "\u0004", MESSAGE = `message${BETWEEN}`;
   const LEAST = 6;             // fixed signs of a message with values: with fewer it would fit any text
-  const texts = new Map(Object.entries(window.tdhilTexts || {})), titles = new Map(Object.entries(window.tdhilTitles || {}));
+  const texts = new Map(Object.entries(window.tdhilTexts || {})), titles = new Map(Object.entries(window.tdhilTitles || {})), labels = new Map(Object.entries(window.tdhilLabels || {}));
   const HOLE = /\{(\w+)\}/g;
   const fill = (text, values) => text.replace(HOLE, (hole, name) => (name in values ? values[name] : hole));
 
@@ -14,6 +14,16 @@
 
   /** A value in a message may be a word of the vocabulary. */
   const value = (text) => ["role", "state", "verdict"].map((context) => texts.get(context + BETWEEN + text)).find(Boolean) ?? text;
+
+  const COMMAND_OR_FLAG = /(tdhil [a-z]+(?: [a-z-]+)?(?: [\w-]+\.\w+)*(?: --[a-z][a-z-]*(?: [A-Z\d][\w.-]*| [\w-]+\.\w+)?)+)|(^|[^\w-])(--?[a-z][a-z-]*)(?![\w-])/g;
+  /** Replace each option of the command line by what the pages call it: the label of this page's field, else what `Language.labels` has. A whole command is for a terminal, and stays. */
+  function byLabels(text) {
+    const label = (flag) => {
+      const field = document.querySelector(`[data-flag="${flag}"]`);
+      return field ? `“${field.dataset.label}”` : labels.get(flag) ?? flag;
+    };
+    return text.replace(COMMAND_OR_FLAG, (found, command, before, flag) => (command ? found : before + label(flag)));
+  }
 
   let patterns = null;
   /** Translate a message of the service, with the values in it; null if it is not known. */
@@ -30,23 +40,28 @@
     }
     return null;
   }
-  /** The text of an error: translated, or the title of its code with the English message behind it. */
-  function errorText(error) {
+  function errorIn(error) {
     if (!texts.size) return error.message;
     const what = phrase(error.what || error.message), next = error.next_step ? phrase(error.next_step) ?? error.next_step : "";
     if (what) return `${error.where ? `${error.where}: ` : ""}${what}${next ? `. ${next}` : ""}`;
     return titles.has(error.code) ? `${titles.get(error.code)}. (${error.code}: ${error.message})` : error.message;
   }
+  /** The text of an error: translated, or the title of its code with the English message behind it. */
+  const errorText = (error) => byLabels(errorIn(error));
   /** A text that the service composes in English, marked as English on a page of another language. */
   function english(text) {
-    if (!texts.size || !text) return text;
+    if (!text) return text;
+    if (!texts.size) return byLabels(text);
     const found = document.createElement("span");
     found.lang = "en";
-    found.textContent = text;
+    found.textContent = byLabels(text);
     return found;
   }
   /** A message of the service as an element or a text: translated if it is known, else in English. */
-  const worded = (text) => phrase(text) ?? english(text);
+  function worded(text) {
+    const known = phrase(text);
+    return known === null ? english(text) : byLabels(known);
+  }
   /** A text of a result with its code: on a page of another language, the title of the code stands before it. */
   const coded = (code, text) => (texts.size && titles.has(code) ? [`${titles.get(code)}. `, english(text)] : [english(text)]);
 
@@ -61,10 +76,11 @@
   const point = (typed) => typed.trim().replace(/^([-+]?\d*),(?=\d)/, "$1.");
 
   document.addEventListener("DOMContentLoaded", () => {
+    for (const one of document.querySelectorAll("[data-flags]")) one.textContent = byLabels(one.textContent);
     for (const one of document.querySelectorAll("[data-language]")) one.addEventListener("click", () => {
       document.cookie = `tdhil-language=${one.dataset.language}; path=/; max-age=31536000; samesite=lax`;
       location.reload();
     });
   });
-  window.tdhilLanguage = { coded, english, errorText, fixed, local, point, precise, tick, tr, word, worded };
+  window.tdhilLanguage = { byLabels, coded, english, errorText, fixed, local, point, precise, tick, tr, word, worded };
 })();

@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { english, errorText, local, tr, word } = window.tdhilLanguage;
-  const { API, Refused, asked, axis, badge, byId, byLabels, call, colour, csrf, el, inSpeedUnit, number, onSpeedUnit, pages, refused, rehearsal, show, span, speedUnit, submits, unmark, waiting, when, whyOf } = window.tdhil;
+  const { API, Refused, asked, axis, badge, byId, call, colour, csrf, el, inSpeedUnit, marked, number, onSpeedUnit, pages, refused, rehearsal, show, span, speedUnit, submits, unmark, waiting, when, whyOf } = window.tdhil;
   const QUANTITIES = ["time", "speed", "torque"];
   const BUSY = ["delayed", "identifying"];
   const HEIGHTS = [150, 180];  // of the charts, px; the lower one has the time axis with its label
@@ -114,7 +114,7 @@
       const { preview } = found;
       read = found;
       byId("problem").hidden = !preview.problem;
-      byId("problem").textContent = preview.problem ? byLabels(form, errorText(preview.problem), byId("problem"), false) : "";
+      byId("problem").textContent = preview.problem ? marked(form, errorText(preview.problem), byId("problem"), false) : "";
       if (preview.table) show(byId("table"), table(preview.table, chosen()));
       const reading = preview.reading, place = el("div");
       show(byId("reading"), preview.run ? ofLog(preview.run) : null, reading ? figures(reading) : null, reading ? place : null, reading && reading.samples ? el("p", { class: "dim said" }, byId("reading").dataset.said) : null,
