@@ -118,7 +118,6 @@ _FLAGS = {
     "fd": "--fd",
     "data_bitrate": "--data-bitrate",
     "timing": "--timing",
-    "can_filters": "--filter",
 }
 _VARIABLES = {"interface": "CAN_INTERFACE", "channel": "CAN_CHANNEL", "bitrate": "CAN_BITRATE"}
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
         EXCITATIONS as EXCITATIONS, MODELS as MODELS, SPEED_UNIT_TOLERANCE as SPEED_UNIT_TOLERANCE,
-        has_plateaus as has_plateaus, imported as imported, load as load,
+        USUAL_STAGE_S as USUAL_STAGE_S, has_plateaus as has_plateaus, imported as imported, load as load,
         identified_before_echo as identified_before_echo,
     )
     from tdhil.config.acceptance import (
@@ -40,8 +40,8 @@ else:
         "keywords": "OF_THE_RESULT OF_THE_RUN OF_THE_SIMULATOR values_of with_keywords",
         "options": "ASKED_AGAIN CLOCKS EvidenceOptions OF_A_TRACE OF_EVIDENCE OF_THE_HEAD OPTION OPTIONS "
                    "PUBLISHABLE Topic Option Origin Overrides RunDetails RunOptions STATED Setting form_options",
-        "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE has_plateaus "
-                    "imported load identified_before_echo",
+        "registry": "BUSES DEFAULT_BUS DEFAULT_EXCITATION EXCITATIONS MODELS SPEED_UNIT_TOLERANCE USUAL_STAGE_S "
+                    "has_plateaus imported load identified_before_echo",
         "acceptance": "ACCEPTED_QUANTITIES Expectation expectations_in expectations_of",
         "resolution": "check_values resolve wrong_values",
         "rig": "DriveData Limits Registered Rig load_rig parse_rig require_limits require_name rig_model "

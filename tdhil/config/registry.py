@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any
 
 
@@ -90,6 +91,10 @@ def imported(at: str) -> Any:
 def names(registry: Mapping[str, RegistryEntry], *, periodic: bool = False) -> list[str]:
     """Return the names in their order; with ``periodic``, only the periodic excitations."""
     return [name for name, entry in registry.items() if entry.periodic or not periodic]
+
+
+USUAL_STAGE_S = MappingProxyType({"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0})
+"""Usual duration of each stage, s, for the displays. The plan of the run replaces them."""
 
 
 SPEED_UNIT_TOLERANCE = 0.1

@@ -22,6 +22,7 @@ from rich.text import Text
 from drivers import Command, Outcome, Preflight, Sample
 from profiles import visible
 from profiles.quantities import in_nm
+from tdhil.config import USUAL_STAGE_S
 from tdhil.recording import LiveInertia, Stage
 from tdhil.report.card import minutes
 from tdhil.report.document import SIMULATED
@@ -157,7 +158,6 @@ class PlannedMotion(Protocol):
     def torque_max_nm(self) -> float: ...
 
 
-_EXPECTED_S = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
 _MARKS = {"ok": ("✓", "green"), "degraded": ("~", "yellow"), "aborted": ("✗", "red"), "skipped": ("-", "dim")}
 _REFRESH_S = 0.2
 _LONGEST_FLUSH_S = 2.0
@@ -193,7 +193,7 @@ class LiveDisplay:
         self._on_inertia = on_inertia
         self._show_preflight = show_preflight
         self._painter = Painter()
-        self._view = LiveView(expected_s=dict(_EXPECTED_S))
+        self._view = LiveView(expected_s=dict(USUAL_STAGE_S))
         self._started_s: float | None = None
         self._next_s = 0.0
         self._live: Live | None = None         # used by the painter only

@@ -42,7 +42,7 @@ WATCHED: Final = {
     None: "its page is open", "hidden": "its page is hidden", "closed": "its page was closed or reloaded",
     "silent": "its page sends nothing",
 }
-EXPECTED_S: Final = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
+
 
 class Board:
     """The run's status. A change returns at once, and a thread writes it to disk.

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from drivers import Preflight, PreflightRefused
 from profiles import MessageCode, visible
+from tdhil.config import USUAL_STAGE_S
 from tdhil.numerics import prepare
 from tdhil.service.attendance import (
-    EXPECTED_S,
     LEASE_S,
     WATCHED,
     Board,
@@ -54,7 +54,7 @@ class RunProcess:
         self.store = Store(self.folder.parent.parent)
         self.request: StoredRequest = self.store.request(self.folder.name)
         self.board = Board(self.store, replace(self.store.status(self.request.id), pid=os.getpid(),
-                                               expected_s=EXPECTED_S))
+                                               expected_s=dict(USUAL_STAGE_S)))
         self._plan: dict[str, Any] = {}
         from tdhil.runner import StopRequest
 
@@ -155,7 +155,7 @@ class RunProcess:
             self._plan = plan_of(rig, self.request.options)
             write_json(self.folder / "plan.json", self._plan)
             self.board.know(expected_half_width=self._plan["expected_half_width"],
-                            expected_s={**EXPECTED_S, "acquire": self._plan["duration_s"] + 5.0})
+                            expected_s={**USUAL_STAGE_S, "acquire": self._plan["duration_s"] + 5.0})
         if not asked.peer.embedded:        # written before the bus is opened: a later stop goes to this drive only
             write_json(self.folder / CONNECTION_FILE, kept_connection(asked.options, asked.connection))
         report = has_extra()

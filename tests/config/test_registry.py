@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import json
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,12 +25,22 @@ from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
 from sim_bus.plant.friction.shaft import ShaftParams
 from tdhil.cli.main import build_parser, main
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, RegistryEntry, identified_before_echo, load, names
+from tdhil.config.registry import (
+    BUSES,
+    EXCITATIONS,
+    MODELS,
+    USUAL_STAGE_S,
+    RegistryEntry,
+    identified_before_echo,
+    load,
+    names,
+)
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.estimation import Options, identify
 from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
 from tdhil.recording.csv.excitation import ExcitationFile
+from tdhil.runner import STAGES
 from tdhil.runner.excitation import (
     ExcitationKind,
     MotionLimits,
@@ -249,3 +260,10 @@ def test_no_chain_of_excitations_or_models_is_left():
                         and isinstance(one.value, str)} & apart
                 chains += [f"{path.relative_to(ROOT)}:{node.lineno}: {name}" for name in told]
     assert chains == []
+
+
+def test_the_usual_durations_are_those_of_the_stages_and_stand_in_one_place():
+    assert tuple(USUAL_STAGE_S) == STAGES
+    again = re.compile(r'"setup": [\d.]+, *"speed": [\d.]+')
+    assert [path.name for path in (ROOT / "tdhil").rglob("*.py") if again.search(path.read_text("utf-8"))] == [
+        "registry.py"]

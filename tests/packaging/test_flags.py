@@ -12,8 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9]*(?:-[a-z0-9]+)*(?![\w-])")
-OF_OTHERS = {"--upgrade": "of pip", "--filter": "of python-can, for a key of its files",
-             "--y": "an abbreviation, which no command takes"}
+OF_OTHERS = {"--upgrade": "of pip", "--y": "an abbreviation, which no command takes"}
 
 
 def flags_of(parser: argparse.ArgumentParser) -> Iterator[str]:
