@@ -101,7 +101,7 @@ class ExcitationFile(DataModel):
     kind: Annotated[str, Registered(EXCITATIONS, periodic=True)] = Field(
         default=DEFAULT_EXCITATION, description="a periodic excitation: multisine, sine, step or prbs"
     )
-    mode: Literal["torque", "speed"] = Field(default="torque", description="what the drive regulated: torque or speed")
+    mode: Literal["torque", "speed"] = Field(default="torque", description="controlled quantity: torque or speed")
     segments: tuple[SegmentFile, ...] = Field(min_length=1, max_length=100, description="in the order of time")
     levels: tuple[LevelFile, ...] = Field(default=(), max_length=100, description="stretches of steady speed, if any")
 
