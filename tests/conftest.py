@@ -58,7 +58,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--heavy", action="store_true", help="only the heavy cases, which CI runs beside the README's")
     parser.addoption("--all-but-long", action="store_true", help="the heavy cases, too")
     parser.addoption("--share", type=share, metavar="K/N", default=(1, 1),
-                     help="of the heavy cases the K-th of N shares, and those that each share has")
+                     help="of the heavy cases the K-th of N shares, and those that each share has; with --long, of all")
 
 
 def share(text: str) -> tuple[int, int]:
@@ -124,19 +124,22 @@ def cases_of(items: list[pytest.Item], name: str) -> set[str]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if not config.getoption("--long"):
+    part = config.getoption("--share")
+    if config.getoption("--long"):
+        chosen = [item for item in items if in_share(item.nodeid, *part)]
+    else:
         only, too = config.getoption("--heavy"), config.getoption("--all-but-long")
         heavy, longest = cases_of(items, "heavy"), cases_of(items, "long")
         always = {item.nodeid for item in items for mark in item.iter_markers("heavy") if mark.kwargs.get("each_share")}
-        other = {nodeid for nodeid in heavy - always if not in_share(nodeid, *config.getoption("--share"))}
+        other = {nodeid for nodeid in heavy - always if not in_share(nodeid, *part)}
         chosen = [
             item for item in items
             if item.nodeid not in longest and item.nodeid not in other and (too or (item.nodeid in heavy) is only)
         ]
-        if len(chosen) < len(items):
-            kept = set(chosen)
-            config.hook.pytest_deselected(items=[item for item in items if item not in kept])
-            items[:] = chosen
+    if len(chosen) < len(items):
+        kept = set(chosen)
+        config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+        items[:] = chosen
     write_to = getattr(config, "workerinput", {}).get(GROUPS)
     if write_to is not None:
         marks = ((item.nodeid, item.get_closest_marker("one_worker")) for item in items)
