@@ -1,8 +1,8 @@
 """Report as PDF on A4: figures and letters as vectors, by matplotlib alone (docs/decisions/0009).
 
 A sheet is filled from the top. A heading stays with the next block, and a figure with its caption. A table stays on one
-sheet if that leaves at most a quarter of the sheet before it empty. Otherwise it is split between rows, and its head is
-repeated. All lengths are in points.
+sheet if that leaves little of the sheet before it empty. Otherwise it is split between rows, and its head is repeated.
+Several layouts are tried, and `_Sheets.rank` chooses one. All lengths are in points.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BytesIO
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from tdhil.report.blocks import WIDTH_IN, AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
@@ -46,15 +47,25 @@ def pdf_bytes(report: Report) -> bytes:
 
 
 def sheets_of(report: Report) -> list[Figure]:
-    """Return the sheets as figures of A4, with their feet.
+    """Return the sheets as figures of A4, with their feet, in the layout of the lowest rank.
 
-    The pictures get the height that needs the fewest sheets, without a last sheet that is mostly empty.
+    If a sheet is left too empty, the sheet before the last is tried shorter, which moves content to the last.
     """
     with _fonts():
-        laid_out = [_Sheets(report.simulated, scale, _running_head(report)) for scale in _PICTURE_SCALES]
-        for sheets in laid_out:
-            _write(sheets, report)
-        return min(laid_out, key=lambda one: one.emptiness).drawn(report.footer)
+        laid_out = [_laid_out(report, *layout) for layout in product(_PICTURE_SCALES, _MOST_EMPTY)]
+        best = min(laid_out, key=lambda one: one.rank)
+        count, excess, *_ = best.rank
+        if excess > 0.0 and count > 1:
+            laid_out += [_laid_out(report, *layout)
+                         for layout in product(_PICTURE_SCALES, _MOST_EMPTY, [count - 1], _SHORTER)]
+            best = min(laid_out, key=lambda one: one.rank)
+        return best.drawn(report.footer)
+
+
+def _laid_out(report: Report, *layout: Any) -> _Sheets:
+    sheets = _Sheets(report.simulated, _running_head(report), *layout)
+    _write(sheets, report)
+    return sheets
 
 
 def _running_head(report: Report) -> str:
@@ -73,34 +84,44 @@ def _fonts() -> Iterator[None]:
         yield
 
 
-_PICTURE_SCALES = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 1.05, 1.1, 1.15, 1.2)
+_PICTURE_SCALES = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 1.05, 1.1, 1.15, 1.2, 1.25, 1.3)
 """Heights of the pictures that are tried, relative to their own. A flatter picture is hard to read."""
-_LEAST_FILLED = 0.25
-"""Share of the last sheet that is filled at least, if any height of the pictures allows it."""
+_MOST_EMPTY = (0.25 * (BOTTOM - TOP), 0.0)
+"""Spaces that are tried: the largest that a table leaves empty on a sheet so that it stays in one piece, points."""
+_SHORTER = (38.0, 76.0, 113.0, 150.0, 188.0)
+"""Lengths by which the sheet before the last is tried shorter, points."""
+_LEAST_FILLED = 0.5
+"""Share of the last sheet that is filled at least, if any layout allows it.
+
+A report of little more than one sheet cannot fill a second one: the first would be left emptier than `_MOST_LEFT`.
+"""
 _MOST_LEFT = 0.25
-"""Share of any other sheet that is left empty at most, if any height of the pictures allows it."""
+"""Share of any other sheet that is left empty at most, if any layout allows it."""
 
 
 class _Sheets:
     """Sheets so far: the pieces of each with their positions. They are drawn when all is laid out.
 
-    ``at``: the position up to which the last sheet is filled. ``scale``: relative height of the pictures. ``figure``:
-    the sheet that is drawn.
+    ``at``: the position up to which the last sheet is filled. ``scale``: relative height of the pictures.
+    ``most_empty``: see `_MOST_EMPTY`. Sheet number ``short`` is ``shorter`` by these points. ``figure``: the sheet that
+    is drawn.
     """
 
     figure: Figure
 
-    def __init__(self, banner: str, scale: float, running_head: str) -> None:
+    def __init__(self, banner: str, running_head: str, scale: float, most_empty: float, short: int = 0,
+                 shorter: float = 0.0) -> None:
         self._pieces: list[list[tuple[float, Draw]]] = []
         self._left: list[float] = []        # points left empty on each sheet but the last
         self.at = BOTTOM
-        self.scale = scale
+        self.scale, self.most_empty = scale, most_empty
+        self._short, self._shorter = short, shorter
         self._banner, self._running_head = banner, running_head
         self._top = TOP
 
     def place(self, height: float, draw: Draw, space: float = 0.0) -> None:
         """Add a piece of this height that stays together, below a space (none at the top of a sheet)."""
-        if not self._pieces or (self.at + space + height > BOTTOM and not self.fresh):
+        if not self._pieces or (space + height > self.room() and not self.fresh):
             self.new()
         if self.fresh:
             space = 0.0
@@ -110,7 +131,8 @@ class _Sheets:
 
     def room(self, space: float = 0.0) -> float:
         """Return the height left on this sheet below a space."""
-        return BOTTOM - self.at - space if self._pieces else BOTTOM - TOP
+        bottom = BOTTOM - (self._shorter if max(len(self._pieces), 1) == self._short else 0.0)
+        return bottom - self.at - space if self._pieces else bottom - TOP
 
     def new(self) -> None:
         """Begin another sheet."""
@@ -126,13 +148,17 @@ class _Sheets:
         return bool(self._pieces) and self.at == self._top
 
     @property
-    def emptiness(self) -> tuple[int, bool, bool, float]:
-        """Return a rank: number of sheets, whether the last one is mostly empty, whether another one has a large empty
-        part, and the change of the pictures.
+    def rank(self) -> tuple[int, float, bool, float, float]:
+        """Return what is compared between layouts, the most important first.
+
+        Number of sheets; by how much the emptiest sheet exceeds its limit, as a share of the sheet; then how far the
+        layout is from the usual one: tables split, heights of the pictures, a shorter sheet.
         """
-        filled = (self.at - TOP) / (BOTTOM - TOP)
-        return (len(self._pieces), len(self._pieces) > 1 and filled < _LEAST_FILLED,
-                max(self._left, default=0.0) > _MOST_LEFT * (BOTTOM - TOP), abs(self.scale - 1.0))
+        high = BOTTOM - TOP
+        last = (BOTTOM - self.at) / high - (1.0 - _LEAST_FILLED) if len(self._pieces) > 1 else 0.0
+        excess = max(0.0, last, max(self._left, default=0.0) / high - _MOST_LEFT)
+        return (len(self._pieces), round(excess, 2), self.most_empty != _MOST_EMPTY[0], abs(self.scale - 1.0),
+                self._shorter)
 
     def drawn(self, footer: str) -> list[Figure]:
         """Draw all sheets, with a foot each."""
@@ -348,8 +374,6 @@ def _picture(sheets: _Sheets, heading: str | None, block: Picture) -> None:
     _headed(sheets, heading, height + 2.0 + len(caption) * SMALL * _LEADING, draw)
 
 
-_MOST_EMPTY = 0.25 * (BOTTOM - TOP)
-"""Largest space that a table leaves empty on a sheet so that it stays in one piece, points."""
 _LEAST_ROWS = 3
 """Fewest rows of a split table on one sheet."""
 
@@ -363,7 +387,7 @@ def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
     height = head_height + sum(row.height for row in rows)
     above = 13.0 + _HEADING if heading is not None else 5.0
     room, whole = sheets.room(above), BOTTOM - TOP - 40.0
-    if height <= room or (height <= whole and room <= _MOST_EMPTY):
+    if height <= room or (height <= whole and room <= sheets.most_empty):
         _headed(sheets, heading, height, lambda on, y: _draw_rows(on, y, head, rows))
         return
     while rows:

@@ -80,12 +80,39 @@ def test_a_long_table_is_split_with_its_head_and_a_short_one_never():
     assert sum("frequency, Hz" in texts for texts in short) == 1
 
 
-def test_no_sheet_but_the_last_is_half_empty():
+def lowest_of(figure):
+    """The lowest text above the foot of a sheet, points."""
+    return min(y0 for _, _, y0, _, _ in texts_of(figure) if y0 > 40.0)
+
+
+def stopped():
+    """A result from the stages before the excitation: no frequencies, and less of everything."""
+    everything = full()
+    return replace(everything, lines=(), friction_curve=(), second_opinions=(), compliant=None)
+
+
+def test_no_sheet_is_half_empty():
     figures = sheets_of(report(full()))
     assert len(figures) <= 4
     for figure in figures[:-1]:
-        lowest = min([y0 for text, _, y0, _, _ in texts_of(figure) if y0 > 40.0])
-        assert lowest < 0.45 * HIGH
+        assert lowest_of(figure) < 0.4 * HIGH
+    assert lowest_of(figures[-1]) < 0.5 * HIGH
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("make", [open_sided, wordy, stopped])
+def test_the_last_sheet_of_other_reports_is_half_full(make):
+    *others, last = sheets_of(report(make()))
+    assert all(lowest_of(figure) < 0.4 * HIGH for figure in others)
+    assert lowest_of(last) < 0.5 * HIGH
+
+
+@pytest.mark.heavy
+def test_a_report_of_little_more_than_a_sheet_is_shared_between_two():
+    """The second sheet cannot be half full without an empty part of the first: it is fuller than before."""
+    first, second = sheets_of(report(bare()))
+    assert lowest_of(first) < 0.35 * HIGH
+    assert lowest_of(second) < 0.7 * HIGH
 
 
 @pytest.mark.heavy
@@ -96,8 +123,8 @@ def test_a_table_leaves_no_sheet_before_it_mostly_empty(lines):
     found = replace(everything, lines=tuple(replace(everything.lines[0], hertz=0.01 * k) for k in range(1, lines + 1)))
     figures = sheets_of(report(found))
     for figure in figures[:-1]:
-        lowest = min([y0 for _, _, y0, _, _ in texts_of(figure) if y0 > 40.0])
-        assert lowest < 0.4 * HIGH
+        assert lowest_of(figure) < 0.4 * HIGH
+    assert lowest_of(figures[-1]) < 0.5 * HIGH
     rows = [sum(bool(re.fullmatch(r"0\.\d\d?", text)) for text, *_ in texts_of(figure)) for figure in figures]
     assert all(count == 0 or count >= 3 for count in rows)
 
