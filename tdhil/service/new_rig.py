@@ -1,6 +1,6 @@
 """A rig that is added in the browser: profiles to choose from, the draft of its file with every mistake, its file.
 
-Nothing here opens a bus. A scan is `tdhil scan` in a process of its own.
+Nothing here opens a bus. A scan is `tdhil scan`, and a check is `tdhil doctor`, each in a process of its own.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from drivers import CommunicationLost
 from profiles import DataFileError, Profile, load_profile, profile_names
 from tdhil.buses import FoundDrive, bus_named, required_text
 from tdhil.config import Limits, Rig, parse_rig
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.service.schemas import (
     DraftBody,
     DraftProblemView,
@@ -31,8 +31,8 @@ from tdhil.service.schemas import (
 from tdhil.service.start_request import NEW_RIG_MOTIONS, ValuesWrong
 from tdhil.session import LIMIT_KEYS, STRING_KEYS, RigEntries, blank_rig, by_hand, doubtful
 
-SCAN_LIMIT_S: Final = 120.0
-"""Longest scan, s; a serial line with all its settings takes most of it."""
+LONGEST_S: Final = 120.0
+"""Longest scan or check, s; a scan of a serial line with all its settings takes most of it."""
 DRAFT: Final = "rig.yaml"
 """Name of the draft in the places of its mistakes."""
 
@@ -161,27 +161,31 @@ def scan_for(body: DraftBody) -> ScanView:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / DRAFT
         place.write_text(text, encoding="utf-8")
-        command = [sys.executable, "-m", "tdhil", "scan", "--rig", str(place), "--json"]
-        try:
-            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-                                  timeout=SCAN_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            raise CommunicationLost(f"the scan did not end within {SCAN_LIMIT_S:.0f} s", where="scan",
-                                    next_step="Check the interface, and narrow the address") from None
-    try:
-        document: dict[str, Any] = json.loads(done.stdout)
-    except ValueError:
-        document = {}
-    if done.returncode != 0 or "found" not in document:
-        if said := str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:]):
-            raise CommunicationLost(said)            # with its own next step
-        raise CommunicationLost("no reply", where="scan",
-                                next_step="Check the drive's supply, the wiring and the address")
+        document = document_of("scan", place, "found", [ExitCode.OK])
     return ScanView([
         FoundDriveView(one["address"], one["title"], one["identity"], one["simulated"], one["profile"], one["why"],
                        {**{name: str(value) for name, value in one["line"].items()},
                         **_address_of(profile.bus, one["address"])})
         for one in document["found"]], list(document.get("remarks", [])))
+
+
+def document_of(command: str, place: Path, key: str, fine: Sequence[ExitCode]) -> dict[str, Any]:
+    """Return the document of a command for a rig's file, with ``key``. Raises CommunicationLost without it."""
+    try:
+        done = subprocess.run([sys.executable, "-m", "tdhil", command, "--rig", str(place), "--json"], check=False,
+                              stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=LONGEST_S)
+    except subprocess.TimeoutExpired:
+        raise CommunicationLost(f"the {command} did not end within {LONGEST_S:.0f} s", where=command,
+                                next_step="Check the interface, and narrow the address") from None
+    try:
+        document: dict[str, Any] = json.loads(done.stdout)
+    except ValueError:
+        document = {}
+    if done.returncode in fine and key in document:
+        return document
+    if said := str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:]):
+        raise CommunicationLost(said)                # with its own next step
+    raise CommunicationLost("no reply", where=command, next_step="Check the drive's supply, the wiring and the address")
 
 
 def _address_of(bus: str, number: int) -> dict[str, str]:

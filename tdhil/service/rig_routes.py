@@ -6,6 +6,7 @@ import hashlib
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from tdhil.buses import DoctorFinding
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
@@ -18,6 +19,7 @@ from tdhil.service.schemas import (
     FaultView,
     PaceView,
     PlanView,
+    RigCheckView,
     RigFileBody,
     RigFileView,
     RigView,
@@ -40,7 +42,7 @@ LARGEST_KG_M2: Final = 1e9
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of the rigs."""
-    return apis(site, rigs, rig, rig_file, edit_rig, trend, calibration, plan, pace, start, stop_rig, faults)
+    return apis(site, rigs, rig, rig_file, edit_rig, trend, calibration, plan, pace, check_rig, start, stop_rig, faults)
 
 
 async def rigs(site: Site, request: Request, body: None) -> list[RigView]:
@@ -98,6 +100,17 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
                        next_step="Measure when that run has ended")
     asked = {"rig_file": str(found.path.resolve()), "options": {}}
     return PaceView(found.id, await site.work("pace", None, asked))
+
+
+async def check_rig(site: Site, request: Request, body: Any) -> RigCheckView:
+    """Check a rig's drive without motion. Raises Conflict while a real shaft may turn."""
+    found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
+    if site.supervisor.turning():
+        raise Conflict("a real shaft turns, and a check could disturb its bus", where=f"rig {found.id}",
+                       next_step="Check when that run has ended")
+    site.supervisor.note(principal(request).name, "rig checked", None, found.id)
+    asked = {"rig_file": str(found.path.resolve()), "runs_folder": str(site.store.runs)}
+    return RigCheckView(found.id, [DoctorFinding(**one) for one in (await site.work("check", None, asked))["checks"]])
 
 
 async def trend(site: Site, request: Request, body: None) -> TrendView:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Final, Literal
 
 from pydantic import ConfigDict, TypeAdapter
 
+from tdhil.buses import DoctorFinding
 from tdhil.service.acceptance_signature import AcceptanceSignature
 from tdhil.service.accounts import Role
 from tdhil.service.annotations import AnnotationEdit
@@ -251,6 +252,14 @@ class PaceView:
 
     rig: str
     pace: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RigCheckView:
+    """Findings of `tdhil doctor` on a rig: ``bad`` prevents a run or makes it unsafe; ``do``: the remedy."""
+
+    rig: str
+    checks: list[DoctorFinding]
 
 
 @dataclass(frozen=True)
@@ -713,6 +722,8 @@ ROUTES: Final = (
           OPTIONS, (403, 404, 409, 422)),
     Route("GET", "/rigs/{rig}/pace", "pace", "Measure whether this computer sustains a simulated rig's cycle rate",
           "operator", {200: PaceView}, errors=(403, 404, 409, 422)),
+    Route("POST", "/rigs/{rig}/check", "check_rig", "Check a rig's drive by tdhil doctor; nothing is written to it",
+          "operator", {200: RigCheckView}, Nothing, (403, 404, 409, 422, 503)),
     Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
           (403, 404, 409, 422, 429, 503, 507),
           headers={"Idempotency-Key": "the same key returns the same run and never starts a second one, also after"

@@ -20,7 +20,7 @@ from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told, disk_full
 
-NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "scan": 0, "pace": 0}
+NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "scan": 0, "check": 0, "pace": 0}
 """Nice values of the tasks for which a page waits. A run by the clock has 0."""
 USUAL_NICE: Final = 19
 
@@ -157,6 +157,16 @@ def scan(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": plain(scan_for(adapter(DraftBody).validate_python(asked["draft"])), ScanView)}
 
 
+def check(asked: dict[str, Any]) -> dict[str, Any]:
+    """Check a rig's drive by `tdhil doctor`. It writes no object, and nothing moves."""
+    from tdhil.errors import ExitCode
+    from tdhil.service.new_rig import document_of
+
+    os.chdir(asked["runs_folder"])
+    found = document_of("doctor", Path(asked["rig_file"]), "checks", [ExitCode.OK, ExitCode.REFUSED])
+    return {"document": {"checks": found["checks"]}}
+
+
 def preview(asked: dict[str, Any]) -> dict[str, Any]:
     """Return what an uploaded recording contains, and how it is read with the requested mapping."""
     from tdhil.service.upload_work import preview_of
@@ -191,7 +201,7 @@ def evidence(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 WORK: Final = {
-    "plan": plan, "scan": scan, "pace": pace, "replay": replay, "report": report, "samples": samples,
+    "plan": plan, "scan": scan, "check": check, "pace": pace, "replay": replay, "report": report, "samples": samples,
     "recover": recover, "trend": trend, "compare": compare, "calibrate": calibrate, "preview": preview,
     "upload": upload, "evidence": evidence,
 }

@@ -112,7 +112,7 @@ def test_every_route_for_everybody(guarded, monkeypatch):
     """
     run = guarded.run()
     wait_for("its end", lambda: not guarded.service.supervisor.live())
-    monkeypatch.setattr(guarded.service.supervisor, "work", lambda what, run, asked: {"document": {}})
+    monkeypatch.setattr(guarded.service.supervisor, "work", lambda what, run, asked: {"document": {"checks": []}})
     everybody: dict[str, tuple[dict[str, str], int]] = {
         "nobody": ({}, -1), "a login that has ended": (guarded.ended("admin"), -1),
         "a machine": (guarded.of_token("operator"), 1),
@@ -155,7 +155,8 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
     sees and stops; what else somebody may, stands here."""
     least = {
         "operator": {"start", "confirm", "renew", "ask_replay", "calibration", "ask_fleet", "stop_fleet", "pace",
-                     "annotate", "uploads", "upload", "one_upload", "preview", "identify_upload", "delete_upload"},
+                     "check_rig", "annotate", "uploads", "upload", "one_upload", "preview", "identify_upload",
+                     "delete_upload"},
         "engineer": {"edit_rig", "sign_off", "archive", "sign_acceptance", "make_evidence", "add_rig", "draft_rig",
                      "scan_bus"},
         "admin": {"audit", "delete_run", "change_letterhead", "accounts", "add_user", "set_password", "remove_user",

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
+from drivers import CommunicationLost
 from profiles import load_profile, profile_names
 from tdhil.config import parse_rig
-from tdhil.service import new_rig
+from tdhil.service import new_rig, worker
 from tdhil.service.new_rig import draft_of, new_rig_view
 from tdhil.service.schemas import DraftBody
 from tests.service.conftest import URL, Service, wait_for
@@ -216,6 +217,39 @@ def test_the_scan_is_that_of_the_command_line(monkeypatch):
     assert parse_rig(seen["text"], "rig.yaml").get("bus").channel == "can0"
     assert (found.found[0].profile, found.found[0].fields) == ("maxon/epos4", {"node": "3"})
     assert found.remarks == ["one drive"]
+
+
+@pytest.mark.heavy
+def test_a_rig_is_checked_without_motion(call, service):
+    text = call("POST", "/new-rig/draft", 200, json={"profile": "maxon/epos4", "simulated": True, "name": "b"})["text"]
+    call("POST", "/rigs", 201, json={"id": "bench-4", "text": text})
+    checks = call("POST", "/rigs/bench-4/check", 200, json={})["checks"]
+    grades = {one["name"]: one["grade"] for one in checks}
+    assert {"drive", "identity", "peer", "watchdog", "modes", "limits", "setting", "state"} <= grades.keys()
+    assert "bad" not in grades.values() and service.store.ids() == []
+    wait_for("the audit", lambda: "rig checked" in {one.what for one in service.audit.entries()})
+
+
+def test_no_rig_is_checked_while_a_real_shaft_may_turn(call, service, monkeypatch):
+    rig = call("GET", "/rigs", 200)[0]["id"]
+    monkeypatch.setattr(service.supervisor, "work", lambda *asked: pytest.fail("nothing is opened"))
+    monkeypatch.setattr(service.supervisor, "turning", lambda: True)
+    assert "shaft turns" in call("POST", f"/rigs/{rig}/check", 409, json={})["error"]["message"]
+
+
+def test_the_check_is_that_of_the_command_line(monkeypatch, tmp_path):
+    """A check that failed is a result: the exit code is 4 then. Without findings, the reason is named."""
+    failed = {"grade": "bad", "name": "identity", "said": "another drive", "do": "choose its profile"}
+    reply = SimpleNamespace(returncode=4, stdout=json.dumps({"checks": [failed], "exit_code": 4}), stderr="")
+    seen = []
+    monkeypatch.setattr(new_rig.subprocess, "run", lambda command, **how: seen.append(command) or reply)
+    monkeypatch.chdir(tmp_path)
+    asked = {"rig_file": "rig.yaml", "runs_folder": str(tmp_path)}
+    assert worker.check(asked) == {"document": {"checks": [failed]}}
+    assert seen[0][1:] == ["-m", "tdhil", "doctor", "--rig", "rig.yaml", "--json"]
+    reply.stdout, reply.stderr = "", "rig.yaml: limits: must be a mapping"
+    with pytest.raises(CommunicationLost, match="must be a mapping"):
+        worker.check(asked)
 
 
 @pytest.mark.parametrize("reply", [

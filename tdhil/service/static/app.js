@@ -424,12 +424,39 @@
     }
   }
 
+  const CHECK_MS = 130000;     // the service ends a check after 120 s
+  /** Check the drive without motion: each finding with its result in words. */
+  function driveCheck(rig) {
+    const button = byId("check-drive"), where = byId("check-said");
+    const results = { ok: ["ok", tr("pass")], note: ["note", tr("for information")], bad: ["refused", tr("fail")] };
+    button.addEventListener("click", async () => {
+      button.disabled = true;
+      const over = waiting(where, tr("Checking"), "check");
+      try {
+        const { checks } = await call("POST", `/rigs/${encodeURIComponent(rig)}/check`, {}, {}, CHECK_MS);
+        over(true);
+        const failed = checks.filter((one) => one.grade === "bad").length;
+        show(where,
+          el("p", { class: failed ? "alarm" : "verdict good", role: "status" }, failed ? tr("Failed: {count} of {all} checks. Correct them before the first motion.", { count: failed, all: checks.length }) : tr("No check failed. Nothing has moved.")),
+          el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": tr("Findings of the check") }, el("table", {},
+            el("thead", {}, el("tr", {}, ...[tr("result"), tr("check"), tr("found"), tr("what to do")].map((text) => el("th", { scope: "col" }, text)))),
+            el("tbody", {}, ...checks.map((one) => el("tr", { class: results[one.grade][0] }, el("td", {}, results[one.grade][1]), el("th", { scope: "row" }, english(one.name)), el("td", {}, english(one.said)), el("td", {}, english(one.do))))))));
+      } catch (error) {
+        over();
+        show(where, el("p", { class: "alarm", role: "alert" }, whyOf(error)));
+      } finally {
+        button.disabled = false;
+      }
+    });
+  }
+
   const PLAN_MS = 300000;      // a narrow tolerance on a computer under load
   function startPage() {
     const rig = document.body.dataset.rig;
     const form = byId("ask");
     if (!form) return;
     const paced = pacing(rig, form);
+    driveCheck(rig);
     if (byId("first") && new URLSearchParams(location.search).get("first") === "true") firstMotion(form, byId("first"));
     let key = null, keyFor = "";
     /** Say an error, and mark the fields that it names. */

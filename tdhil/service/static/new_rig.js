@@ -170,7 +170,7 @@
         if (!save || found.problems.length) return;
         const made = await call("POST", "/rigs", { id: field("id").value.trim(), text: found.text });
         try { sessionStorage.removeItem(KEPT); } catch (error) { /* nothing was kept */ }
-        location.assign(made.motion === "never" && !made.simulated ? "/" : `/start/${encodeURIComponent(made.id)}${made.simulated ? "" : "?first=true"}`);
+        location.assign(`/start/${encodeURIComponent(made.id)}${made.simulated ? "" : "?first=true"}`);
       } catch (error) {
         refused(error);
       }

@@ -169,6 +169,18 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     page.get_by_text("The shaft moves for the first time: at most 200 N·m and 3 rad.").wait_for()
     filled = [page.locator(f"[name={name}_rad_s]").input_value() for name in ("offset", "amplitude")]
     assert filled == ["27.5", "9"]                     # rpm, as the switch says: 2.88 and 0.942 rad/s
+    checks = [{"grade": grade, "name": HOSTILE, "said": HOSTILE, "do": do} for grade, do in
+              (("ok", ""), ("note", ""), ("bad", "Choose its own profile"))]
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, sent: {"document": {"checks": checks}})
+    page.get_by_role("button", name="Check the drive").click()          # before the first motion, and without any
+    page.get_by_text("Failed: 1 of 3 checks. Correct them before the first motion.").wait_for()
+    rows = page.get_by_role("region", name="Findings of the check").locator("tbody tr")
+    assert [row.locator("td").first.inner_text() for row in rows.all()] == ["pass", "for information", "fail"]
+    assert "Choose its own profile" in rows.nth(2).inner_text()
+    del checks[2]
+    page.get_by_role("button", name="Check the drive").click()
+    page.get_by_text("No check failed. Nothing has moved.").wait_for()
+    assert served.service.store.ids() == []
     assert "speed_max_rad_s:         \"95 rpm\"" in (rigs / "bench-3.yaml").read_text()
     assert page.evaluate("window.pwned") is None
 
