@@ -2,6 +2,7 @@
 
     python benchmarks/waiting_time.py [--rounds 5] [--cycles 73000] [--require-replay 2.2] [--require-run 1.0]
                                       [--require-tune 10] [--require-help 5]
+    python benchmarks/waiting_time.py --click [--rounds 5] [--busy 8]
 
 replay  `tdhil replay run.mcap` beside `import numpy, scipy.linalg, scipy.special`, each a process of its own. The
         import has as many threads as numpy takes by itself.
@@ -11,6 +12,10 @@ tune    `tdhil tune soft-torque` for a top drive and a string of 3000 m, in seco
         does nothing else.
 help    `tdhil --help` beside `import argparse`, each a process of its own. The limit is that of issue 26, 0.1 s, over
         the 0.02 s that the import takes on the computer of benchmarks/README.md.
+
+click   a simulated run in Chromium: seconds from the click on Start until the page shows J, and until its first picture
+        is drawn. First with nothing beside it, then beside ``--busy`` processes that never pause. Measured alone, with
+        `--click` (extra `browser`); no limit holds.
 
 User CPU time of the child processes (getrusage). The processes take turns, and the median of the rounds counts. Other
 programs on this computer change the seconds. The ratios change less. The exit code is 1 if a limit is exceeded.
@@ -27,7 +32,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -39,6 +45,10 @@ RESULT = {
     ("inertia_kg_m2", 15.0, 14.4, 15.6), ("viscous_nm_s_rad", 0.08, 0.07, 0.09), ("coulomb_nm", 6.0, 5.9, 6.1),
     ("speed_lag_s", 0.4, 0.39, 0.41))}
 """Result of an identification, for `tune`: a top drive, at the motor shaft."""
+CLICKED = "simulated-canopen"
+"""The rig whose run is started by a click; it is in each service without rigs of its own."""
+DRAWN = "() => [...document.querySelectorAll('figure img')].some((one) => one.complete && one.naturalWidth > 0)"
+BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"
 BARE_LOOP = "from benchmarks.cycle_rate import bare; bare({cycles})"
 
 
@@ -56,6 +66,55 @@ def wall_s(command: list[str], environment: Mapping[str, str]) -> float:
     return time.monotonic() - began_s
 
 
+@contextmanager
+def beside(busy: int) -> Iterator[None]:
+    """Run this number of processes that never pause."""
+    others = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(busy)]
+    try:
+        yield
+    finally:
+        for one in others:
+            one.kill()
+            one.wait()
+
+
+def click_s(rounds: int) -> list[tuple[float, float]]:
+    """Seconds from a click on Start until J is shown, and until the first picture is drawn; of each round."""
+    import shutil
+
+    from playwright.sync_api import sync_playwright
+
+    sys.path.insert(0, str(ROOT))
+    from tests.service.test_serve import served
+
+    browser = os.environ.get("TDHIL_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    found = []
+    with tempfile.TemporaryDirectory() as data, served(Path(data) / "data") as server, sync_playwright() as engine:
+        chromium = engine.chromium.launch(executable_path=browser, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        page = chromium.new_page(base_url=server.url, viewport={"width": 1280, "height": 1180})
+        page.set_default_timeout(600_000)
+        for _ in range(rounds):
+            page.goto(f"/start/{CLICKED}")
+            page.get_by_role("button", name="Start", exact=True).click()
+            began_s = time.monotonic()
+            page.locator("p.figure.large").first.wait_for()
+            shown_s = time.monotonic() - began_s
+            page.wait_for_function(DRAWN)
+            found.append((shown_s, time.monotonic() - began_s))
+        chromium.close()
+    return found
+
+
+def clicks(rounds: int, busy: int) -> None:
+    """Print the times after a click, on this computer as it is and beside busy processes."""
+    for count in (0, busy):
+        with beside(count):
+            both = click_s(rounds)
+        for name, each in zip(("J", "picture"), zip(*both, strict=True), strict=True):
+            print(f"click to {name:8} beside {count} busy processes {statistics.median(each):7.2f} s "
+                  f"({min(each):.2f} to {max(each):.2f}), load {os.getloadavg()[0]:.1f} at the end")
+
+
 def main() -> int:
     """Print the medians and the ratios. Return 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
@@ -67,7 +126,12 @@ def main() -> int:
     parser.add_argument("--require-tune", type=float, default=10.0, metavar="S", help="longest tuning, s")
     parser.add_argument("--require-help", type=float, default=5.0, metavar="R",
                         help="largest ratio of the help to an import of argparse")
+    parser.add_argument("--click", action="store_true", help="measure only the click, in Chromium")
+    parser.add_argument("--busy", type=int, default=8, help="processes beside the second measurement of the click")
     wanted = parser.parse_args()
+    if wanted.click:
+        clicks(wanted.rounds, wanted.busy)
+        return 0
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     with tempfile.TemporaryDirectory() as folder:

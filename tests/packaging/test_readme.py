@@ -52,6 +52,15 @@ def test_commands_parse(page):
         assert callable(namespace.run), command
 
 
+def test_a_benchmark_on_a_page_has_the_options_that_the_page_names():
+    named = [(script, option) for page in PAGES
+             for script, words in re.findall(r"`python (benchmarks/\w+\.py)( [^`]+)`", page.read_text(encoding="utf-8"))
+             for option in re.findall(r"--[a-z-]+", words)]
+    assert ("benchmarks/waiting_time.py", "--click") in named
+    assert [(script, option) for script, option in named
+            if f'"{option}"' not in (ROOT / script).read_text(encoding="utf-8")] == []
+
+
 def test_the_readme_is_one_page():
     assert len(README.splitlines()) <= 160
 
