@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,8 +32,7 @@ from tdhil.service.schemas import (
 from tdhil.service.start_request import NEW_RIG_MOTIONS, ValuesWrong
 from tdhil.session import LIMIT_KEYS, STRING_KEYS, RigEntries, blank_rig, by_hand, doubtful
 
-LONGEST_S: Final = 120.0
-"""Longest scan or check, s; a scan of a serial line with all its settings takes most of it."""
+LONGEST_S: Final = 120.0         # of a scan or a check; a scan of a serial line with all its settings takes most of it
 DRAFT: Final = "rig.yaml"
 """Name of the draft in the places of its mistakes."""
 
@@ -177,10 +177,9 @@ def document_of(command: str, place: Path, key: str, fine: Sequence[ExitCode]) -
     except subprocess.TimeoutExpired:
         raise CommunicationLost(f"the {command} did not end within {LONGEST_S:.0f} s", where=command,
                                 next_step="Check the interface, and narrow the address") from None
-    try:
-        document: dict[str, Any] = json.loads(done.stdout)
-    except ValueError:
-        document = {}
+    document: dict[str, Any] = {}
+    with suppress(ValueError):
+        document = json.loads(done.stdout)
     if done.returncode in fine and key in document:
         return document
     if said := str((document.get("error") or {}).get("message") or " ".join(done.stderr.split())[-400:]):

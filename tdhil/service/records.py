@@ -82,8 +82,12 @@ class RunRecords:
             if confirm.strip() != run:
                 raise ValuesWrong([("confirm", f"type the id of the run, {run}")])
             self._require_settled(run)
-            self._require_unused(run)
             where = f"run {run}"
+            if run in self._supervisor.live() or lives(folder):
+                raise Conflict("the process of the run is about to end", where=where,
+                               next_step="Try again in some seconds")
+            if self._reading(run):
+                raise Conflict("the log is being identified again", where=where, next_step="Wait until that has ended")
             if self._store.signed_off(run) is not None:
                 raise Conflict("a sign-off refers to this run: it is kept", where=where, next_step="Archive it")
             if self.signature(run) is not None:
@@ -223,15 +227,6 @@ class RunRecords:
         if status.state is State.STOP_NOT_CONFIRMED and self._store.signed_off(run) is None:
             raise Conflict("the stop of this run was neither confirmed nor signed off", where=where,
                            next_step="Check that the shaft is at standstill, then sign it off")
-
-    def _require_unused(self, run: str) -> None:
-        """Raise Conflict while a process still has the files of the run open."""
-        if run in self._supervisor.live() or lives(self._store.place(run)):
-            raise Conflict("the process of the run is about to end", where=f"run {run}",
-                           next_step="Try again in some seconds")
-        if self._reading(run):
-            raise Conflict("the log is being identified again", where=f"run {run}",
-                           next_step="Wait until that has ended")
 
     def _calibration_from(self, log_sha256: str) -> Path | None:
         """Return the calibration file, beside a rig's file or named in it, that was made from this log."""

@@ -19,7 +19,6 @@ from tdhil.service.schemas import (
     FaultView,
     PaceView,
     PlanView,
-    RigCheckView,
     RigFileBody,
     RigFileView,
     RigView,
@@ -102,7 +101,7 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
     return PaceView(found.id, await site.work("pace", None, asked))
 
 
-async def check_rig(site: Site, request: Request, body: Any) -> RigCheckView:
+async def check_rig(site: Site, request: Request, body: Any) -> list[DoctorFinding]:
     """Check a rig's drive without motion. Raises Conflict while a real shaft may turn."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if site.supervisor.turning():
@@ -110,7 +109,7 @@ async def check_rig(site: Site, request: Request, body: Any) -> RigCheckView:
                        next_step="Check when that run has ended")
     site.supervisor.note(principal(request).name, "rig checked", None, found.id)
     asked = {"rig_file": str(found.path.resolve()), "runs_folder": str(site.store.runs)}
-    return RigCheckView(found.id, [DoctorFinding(**one) for one in (await site.work("check", None, asked))["checks"]])
+    return [DoctorFinding(**one) for one in (await site.work("check", None, asked))["checks"]]
 
 
 async def trend(site: Site, request: Request, body: None) -> TrendView:

@@ -255,14 +255,6 @@ class PaceView:
 
 
 @dataclass(frozen=True)
-class RigCheckView:
-    """Findings of `tdhil doctor` on a rig: ``bad`` prevents a run or makes it unsafe; ``do``: the remedy."""
-
-    rig: str
-    checks: list[DoctorFinding]
-
-
-@dataclass(frozen=True)
 class TrendView:
     """A rig's results over time, and whether they changed: the document of `tdhil trend --json`."""
 
@@ -723,7 +715,7 @@ ROUTES: Final = (
     Route("GET", "/rigs/{rig}/pace", "pace", "Measure whether this computer sustains a simulated rig's cycle rate",
           "operator", {200: PaceView}, errors=(403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/check", "check_rig", "Check a rig's drive by tdhil doctor; nothing is written to it",
-          "operator", {200: RigCheckView}, Nothing, (403, 404, 409, 422, 503)),
+          "operator", {200: list[DoctorFinding]}, Nothing, (403, 404, 409, 422, 503)),
     Route("POST", "/rigs/{rig}/runs", "start", "Request a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
           (403, 404, 409, 422, 429, 503, 507),
           headers={"Idempotency-Key": "the same key returns the same run and never starts a second one, also after"

@@ -163,8 +163,7 @@ def check(asked: dict[str, Any]) -> dict[str, Any]:
     from tdhil.service.new_rig import document_of
 
     os.chdir(asked["runs_folder"])
-    found = document_of("doctor", Path(asked["rig_file"]), "checks", [ExitCode.OK, ExitCode.REFUSED])
-    return {"document": {"checks": found["checks"]}}
+    return {"document": document_of("doctor", Path(asked["rig_file"]), "checks", [ExitCode.OK, ExitCode.REFUSED])}
 
 
 def preview(asked: dict[str, Any]) -> dict[str, Any]:

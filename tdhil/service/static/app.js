@@ -433,7 +433,7 @@
       button.disabled = true;
       const over = waiting(where, tr("Checking"), "check");
       try {
-        const { checks } = await call("POST", `/rigs/${encodeURIComponent(rig)}/check`, {}, {}, CHECK_MS);
+        const checks = await call("POST", `/rigs/${encodeURIComponent(rig)}/check`, {}, {}, CHECK_MS);
         over(true);
         const failed = checks.filter((one) => one.grade === "bad").length;
         show(where,
