@@ -154,6 +154,19 @@ def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
     assert signal.getsignal(number) is former
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGQUIT", "SIGTERM", "SIGHUP", "SIGTSTP"])
+def test_a_signal_of_a_user_stops_the_run_also_if_the_program_around_ignores_it(name):
+    """A run under nohup, or in the background of a script, is stopped by each of them."""
+    number = signal.Signals[name]
+    former = signal.signal(number, signal.SIG_IGN)
+    try:
+        with stop_on_signals() as request:
+            signal.raise_signal(number)
+            assert request.signum == number
+    finally:
+        signal.signal(number, former)
+
+
 KILLING = [number for number in sorted(signal.valid_signals()) if number not in {
     # What can't be caught, what a broken program raises, what nobody is killed by, and what Python ignores already.
     signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGCHLD,
