@@ -84,20 +84,25 @@ def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch,
     shaft.assert_at_rest()
 
 
+SEEMS_TO_ACCELERATE = {"yaskawa/ga700"}
+"""Drives whose unsigned torque report shows a quick stop that accelerates: tdhil removes the torque, and the stop is not
+confirmed. Without a drill string this is the rule (docs/explanation/stop.md)."""
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "unsigned"])
 def test_a_missing_sign_that_no_register_tells_ends_in_the_braking_probe(name, monkeypatch, tmp_path):
     """All drives with a torque mode, whatever preflight sees: test_braking_probe. Without one there is no torque to
-    set, and what is reported of it fits no shaft."""
+    set. The shaft then slows down under a torque that is reported as positive, which no shaft does."""
     wired(monkeypatch, "unsigned")
     done, shaft = ran(tmp_path, name)
     if load_modbus_profile(name).modes.torque:
-        assert done.code == 4, done.err
+        assert done.code == (8 if name in SEEMS_TO_ACCELERATE else 4), done.err
         assert "braking probe, register" in done.document["error"]["message"]
         assert np.max(shaft.speed_rad_s) < 7.5          # stage 2, in speed mode; the limit is 10
     else:
-        assert done.code == 9, done.err
-        assert done.document["inertia_kg_m2"] is None
+        assert done.code == 8, done.err      # this torque confirms no standstill either
+        assert "reported speed and torque contradict each other" in done.document["error"]["message"]
         assert np.max(shaft.speed_rad_s) < 10.0
     shaft.assert_at_rest()
 
