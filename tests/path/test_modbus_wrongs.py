@@ -85,8 +85,8 @@ def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch,
 
 
 SEEMS_TO_ACCELERATE = {"yaskawa/ga700"}
-"""Drives whose unsigned torque report shows a quick stop that accelerates: tdhil removes the torque, and the stop is not
-confirmed. Without a drill string this is the rule (docs/explanation/stop.md)."""
+"""Drives whose unsigned torque report shows a quick stop that accelerates: tdhil removes the torque, and the stop is
+not confirmed. Without a drill string this is the rule (docs/explanation/stop.md)."""
 
 
 @pytest.mark.long
