@@ -36,7 +36,7 @@ class MessageCode(Enum):
     RESULT_WARNING = (
         20, "Warning about a result",
         "An assumption of the result needs attention.",
-        "Read the text of the warning, and compare it with the machine.")
+        "Read the warning, and check it against the machine.")
     ONE_MEAN_SPEED = (
         21, "Only one mean speed",
         "The excitation has one mean speed, so viscous friction is identified from the spectral lines alone.",
@@ -51,14 +51,14 @@ class MessageCode(Enum):
         "Repeat the run with another motion, and compare both results.")
     LINES_TOO_WEAK = (
         24, "Some spectral lines are too weak",
-        "The motion at these frequencies is not larger than the noise.",
+        "The motion at these frequencies does not exceed the noise.",
         "Raise --amplitude, or lower the highest frequency.")
     PERIODS_MISSING = (
         25, "Some periods are not usable",
         "Samples are missing in these periods, or the record ended early.",
         "Check the bus load and the log, and repeat the run.")
     SPEED_CHANGES_SIGN = (
-        26, "The speed changes its sign",
+        26, "The speed changes sign",
         "Coulomb friction reverses with the speed, and the model cannot separate this torque from inertia.",
         "Raise the mean speed with --offset, or lower --amplitude.")
     STALE_SAMPLES = (
@@ -74,8 +74,8 @@ class MessageCode(Enum):
         "The run was cut off, so the result uses a part of the data.",
         "Repeat the run if the interval is too wide.")
     RUN_ENDED_EARLY = (
-        30, "The run ended during its motion",
-        "A limit, a fault or an operator ended the run; the result uses the data before this event.",
+        30, "The run ended during motion",
+        "A limit, a fault or an operator ended the run; the result uses the data recorded before.",
         "Remove the cause that the warning names, and repeat the run.")
     STOP_WAS_NOT_CONFIRMED = (
         31, "The stop of the recorded run was not confirmed",
@@ -87,7 +87,7 @@ class MessageCode(Enum):
         "Use the friction value only near the mean speeds of the run.")
     FRICTION_DRIFTS = (
         33, "Friction drifts during the run",
-        "The torque at steady speed changes with time, as bearings warm up or the torque zero drifts.",
+        "The torque at steady speed changes over time, for example as bearings warm up or the torque zero drifts.",
         "Run the machine until it is warm, and repeat the run.")
     UNDECLARED_MOTION = (
         34, "Motion at a frequency that was not excited",
@@ -103,11 +103,11 @@ class MessageCode(Enum):
         "Check friction, load and torque scale, and repeat the run.")
     STEPPED_SETPOINT = (
         37, "Torque is sampled in step with the setpoint",
-        "A slow cycle reads the torque once per setpoint, so its time within the step is not known.",
+        "A slow cycle reads the torque once per setpoint, so the instant within the step is not known.",
         "Shorten the cycle, or use the torque mode of the drive.")
     STRING_MOVES_WITH_MOTOR = (
         38, "The string moves with the motor",
-        "At the excited frequencies motor, string and load move as one body.",
+        "At the excited frequencies, motor, string and load move as one body.",
         "Excite higher frequencies to identify the motor alone.")
     MOTOR_SIDE_ONLY = (
         39, "J is the inertia of the motor's side",
@@ -116,9 +116,9 @@ class MessageCode(Enum):
     RESONANCE_IN_BAND = (
         40, "A resonance lies in the excited band",
         "Shaft and load oscillate against each other at an excited frequency.",
-        "Compare the frequency with the machine's drawing.")
+        "Compare the frequency with the design data of the machine.")
     TOTAL_INERTIA_OPEN = (
-        41, "The total inertia is open on one side",
+        41, "The interval of the total inertia is open on one side",
         "No excited frequency lies far enough below the resonance.",
         "Add a lower frequency with --frequency.")
     LOAD_SWINGS_WIDELY = (
@@ -140,7 +140,7 @@ class MessageCode(Enum):
     SPEED_UNIT_UNSEEN = (
         46, "The unit of speed was accepted without a check",
         "The run used --accept-speed-unit, and a wrong unit changes J in proportion.",
-        "Repeat the run with an operator who watches the shaft.")
+        "Repeat the run with an operator watching the shaft.")
     SPEED_UNLIKE_ANGLE = (
         47, "Speed and angle of the shaft differ",
         "The reported angle moves faster or slower than the reported speed.",
@@ -170,25 +170,25 @@ class MessageCode(Enum):
         "The shaft is a distributed string, and the loop is tuned for its lowest mode.",
         "Use tdhil tune soft-torque for the string.")
     LOOP_UNLIKE_RESPONSE = (
-        58, "The measured response differs from the shaft that was tuned for",
-        "At some lines, shaft and model differ by more than the intervals explain.",
-        "Compare the lines with tdhil frf, and test the gains at a low bandwidth first.")
+        58, "The measured response differs from the shaft model of the tuning",
+        "At some excited frequencies, shaft and model differ by more than the intervals explain.",
+        "Check the response with tdhil frf, and test the gains at a low bandwidth first.")
     PRESENT_GAINS_THIN = (
         59, "The present gains have thin margins",
         "In the worst case, the gains in the drive keep less margin than requested.",
         "Lower the present gains, or type in the tuned ones.")
     LOAD_MAY_STAY_BEHIND = (
-        60, "The load may stay behind the motor",
+        60, "The load may not follow the motor",
         "The excited frequencies do not show whether the load turns with the motor.",
-        "Excite lower frequencies, below the oscillation of the load, or separate the load from the motor.")
+        "Excite frequencies below the resonance of the load, or disconnect the load from the motor.")
     BACKLASH_FOUND = (
         61, "The coupling behind the motor has backlash",
-        "The load changes its flank when the torque on it reverses; the motor then turns by the play without the load.",
+        "When the torque on the load reverses, the motor turns through the play without the load.",
         "Check the coupling and the gear, or raise --offset so that the torque on the load keeps its sign.")
     SCALE_CHANGE_HIDDEN = (
-        62, "A change of scale may stay hidden",
-        "Above this drill string no cross-check can be compared with J.",
-        "Repeat the run and compare the two results.")
+        62, "A change of scale may not be detected",
+        "With this drill string, no cross-check can be compared with J.",
+        "Repeat the run, and compare the two results.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (
@@ -198,7 +198,7 @@ class MessageCode(Enum):
     COMMAND_REJECTED = (
         101, "A setpoint was not sent",
         "tdhil computed a setpoint outside its own limits, and the guard refused it.",
-        "The shaft was stopped. Report it with the log.")
+        "The shaft was stopped. Report it with the log (tdhil support).")
     SYSTEM_REFUSED = (
         102, "The operating system refused a request",
         "Memory, disk space or open files are used up, or a device is gone.",
@@ -224,7 +224,7 @@ class MessageCode(Enum):
     USAGE = (
         200, "The command cannot run as written",
         "An option or a value is wrong, or two options exclude each other.",
-        "Correct what the message names. The option --help of the command lists all options.")
+        "Correct what the message names. Show the options of the command with --help.")
     UNKNOWN_COMMAND = (
         201, "Unknown command",
         "tdhil has no command of this name.",
@@ -242,7 +242,7 @@ class MessageCode(Enum):
         "The path is mistyped, or the file was moved.",
         "Check the path.")
     FILE_EXISTS = (
-        205, "The file exists already",
+        205, "The file already exists",
         "tdhil does not overwrite a file that it should keep.",
         "Name another file, or move the old one.")
     FILE_NOT_WRITABLE = (
@@ -254,8 +254,8 @@ class MessageCode(Enum):
         "The command needs a Python package that this installation does not have.",
         "Install it with the command in the message.")
     WRONG_KIND_OF_FILE = (
-        208, "The file has another content than expected",
-        "The file is not what the option takes, such as a log, a result or a tuning.",
+        208, "The file has unexpected content",
+        "The option takes another kind of file, such as a log, a result or a tuning.",
         "Name the file that the message asks for.")
     SAME_FILE_TWICE = (
         209, "Two options name the same file",
@@ -267,7 +267,7 @@ class MessageCode(Enum):
         "Correct the lines that the message lists.")
     PROFILE_UNKNOWN = (
         211, "Unknown profile",
-        "No profile has this name, and no file is there.",
+        "No profile and no file has this name.",
         "List the profiles with tdhil profiles.")
     PROFILE_OTHER_BUS = (
         212, "The profile belongs to another bus",
@@ -275,7 +275,7 @@ class MessageCode(Enum):
         "Leave --drive out, or choose a profile of this bus.")
     OPTION_OF_ANOTHER_BUS = (
         213, "The option belongs to another bus",
-        "The drive is on another bus than the one that the option is for.",
+        "The option is for one bus, and the drive is on another.",
         "Leave the option out, or change --drive.")
     BUS_NOT_CONFIGURED = (
         214, "No bus is configured",
@@ -295,7 +295,7 @@ class MessageCode(Enum):
         "Add --simulate, or leave --fault out.")
     STEPPED_NEEDS_SYNC = (
         218, "This line cannot run in stepped time",
-        "A Modbus line has no SYNC, so another process cannot be stepped.",
+        "Modbus has no SYNC, so a simulator in another process cannot be stepped.",
         "Leave --stepped out.")
     LOG_NEEDED = (
         219, "No log is named",
@@ -316,7 +316,7 @@ class MessageCode(Enum):
     STRING_MISSING = (
         223, "No drill string is named",
         "Tuning needs the string below the drive.",
-        "Name it with --string, or in load of rig.yaml before the run.")
+        "Name it with --string, or under load in rig.yaml before the run.")
     LAGS_MISSING = (
         224, "A lag of the drive is not known",
         "The result does not state a lag that limits the gains.",
@@ -351,7 +351,7 @@ class MessageCode(Enum):
         "Add a user and a certificate, or use 127.0.0.1.")
     ACCOUNT_WRONG = (
         232, "The account or password is not accepted",
-        "The name or password breaks a rule, exists already, or is not known.",
+        "The name or password breaks a rule, or the account already exists or is not known.",
         "Follow the rule that the message states.")
     LOG_UNOPENED = (
         233, "The output file cannot be opened",
@@ -379,11 +379,11 @@ class MessageCode(Enum):
         "Name another file.")
     EVIDENCE_STATEMENT = (
         239, "The publisher's statement is incomplete",
-        "An archive of evidence needs the publisher, the parts that may be published, and a whole reference inertia.",
+        "An archive of evidence needs the publisher, the parts that may be published, and a full reference inertia.",
         "Add the options that the message names, such as --publisher and --publish.")
     EVIDENCE_SIMULATED = (
-        240, "The run is no evidence about a drive",
-        "The run is of the simulated drive or a rehearsal of faults, or the mark --simulated does not fit the log.",
+        240, "The run is not evidence about a real drive",
+        "The run used the simulated drive or rehearsed a fault, or --simulated does not match the log.",
         "Name the log of a run on a real drive, or mark an example with --simulated.")
     EVIDENCE_INCOMPLETE = (
         241, "The log is incomplete as evidence",
@@ -391,7 +391,7 @@ class MessageCode(Enum):
         "Name the log of a complete run.")
     EVIDENCE_LEAK = (
         242, "The archive would contain a private text",
-        "A path, an address, a password or a key is left in a member of the archive after scrubbing.",
+        "A path, an address, a password or a key remains in a file of the archive after scrubbing.",
         "Correct the texts of the statement, or name the word with --remove.")
 
     # --- 3xx: partial result -----------------------------------------------------------------------------------------
@@ -405,7 +405,7 @@ class MessageCode(Enum):
         "The log is complete. Show the result with tdhil replay.")
     AUDIT_BROKEN = (
         302, "The audit was changed",
-        "The chain of the audit's entries does not match.",
+        "The hash chain of the audit's entries does not match.",
         "Compare the audit with a copy, and find out who changed it.")
 
     # --- 4xx: refused before motion ----------------------------------------------------------------------------------
@@ -482,7 +482,7 @@ class MessageCode(Enum):
         "A row of the preflight table shows another value than required.",
         "Change the setting in the drive, or correct the profile or rig.yaml.")
     DRIVE_LIMIT_TIGHTER = (
-        418, "A limit in the drive is narrower than the run needs",
+        418, "A limit in the drive is too low for the run",
         "The drive's own limit would clip the motion.",
         "Request less motion, or allow the change with --accept-wider-limit.")
     NO_TORQUE_MODE = (
@@ -491,11 +491,11 @@ class MessageCode(Enum):
         "Use --mode speed.")
     EXCITATION_NOT_POSSIBLE = (
         420, "This excitation is not possible here",
-        "The drive's mode, the load or the window of speed does not allow the excitation.",
+        "The drive's mode, the load or the speed window does not allow the excitation.",
         "Use the excitation that the message names, such as --excitation multisine.")
     STRING_NOT_SAFE = (
         421, "Not allowed with a drill string",
-        "A string stores torque; without control of its release it could turn the shaft back.",
+        "A drill string stores torque. Released without control, it could turn the shaft backwards.",
         "Follow the message, or run without the string.")
     PLAN_NOT_POSSIBLE = (
         422, "No motion fits the limits",
@@ -508,7 +508,7 @@ class MessageCode(Enum):
     VIRTUAL_STRING_REFUSED = (
         424, "The virtual string cannot run on this rig",
         "The string, the controller, the limits or the shaft do not fit together.",
-        "Correct what the message names. Nothing moved for the virtual string.")
+        "Correct what the message names. The virtual string was not started.")
     PDO_NOT_POSSIBLE = (
         425, "The PDO mapping is not accepted",
         "The drive has a fixed PDO mapping, or keeps another COB-ID or transmission type.",
@@ -527,8 +527,8 @@ class MessageCode(Enum):
         "Leave --stepped out.")
     UNDO_FILE_PROBLEM = (
         429, "The undo file of the drive's settings is not usable",
-        "tdhil cannot write or read what it changed in the drive.",
-        "Use a folder that can be written, with --log.")
+        "tdhil cannot write or read its record of the settings that it changed in the drive.",
+        "Name a log in a writable folder with --log.")
     NO_FEEDBACK = (
         430, "The drive sends no feedback",
         "The drive does not answer SYNC with its TPDO.",
@@ -551,7 +551,7 @@ class MessageCode(Enum):
         "Log in with the role that the message names, or act at the rig.")
     CONFLICT = (
         435, "The request conflicts with the present state",
-        "Another run has the rig, or the run is in another state.",
+        "Another run uses the rig, or the run is in another state.",
         "Wait for the other run, or sign off its stop.")
     CODE_REFUSED = (
         436, "The operator at the rig did not confirm the run",
@@ -567,7 +567,7 @@ class MessageCode(Enum):
         "Free some space on the disk.")
     PLAN_HOPELESS = (
         439, "The requested motion cannot determine the moment of inertia",
-        "The cycle rate is too low for its spectral lines, or it cannot separate the inertia from lags and friction.",
+        "The cycle rate is too low for its spectral lines, or the motion cannot separate J from lags and friction.",
         "Leave out --frequency and --amplitude, or change them as the message says.")
     NO_RIG_NAME = (
         440, "No name for the rig of a real drive",
@@ -617,7 +617,7 @@ class MessageCode(Enum):
         "Check unit number, baud rate, parity and the polarity of the two wires.")
     BAD_REPLY = (
         509, "A Modbus reply is damaged",
-        "The reply has a wrong check sum, length or address.",
+        "The reply has a wrong checksum, length or address.",
         "Check cable, shielding, termination and baud rate.")
     LINK_LOST = (
         510, "The line to the drive was lost",
@@ -626,13 +626,13 @@ class MessageCode(Enum):
     SERVER_UNREACHABLE = (
         511, "A server does not answer",
         "The socketcand server, the service or a run's process cannot be reached.",
-        "Check its address, and that it runs.")
+        "Check its address, and check that it is running.")
     RUN_NOT_REACTING = (
-        512, "The run's process does not react",
+        512, "The run's process does not respond",
         "The process was suspended, and does not read requests.",
         "Use the hard-wired stop. The drive's watchdog stops the shaft.")
     UPLOAD_WITHOUT_END = (
-        513, "The drive sends an object without an end",
+        513, "The drive sends an object that does not end",
         "A reply to an SDO request is longer than any object that tdhil reads, or its segments do not end in time.",
         "Compare the object with the drive's manual. Update the firmware of the drive or of the gateway.")
     FEEDBACK_REPEATS = (
@@ -651,7 +651,7 @@ class MessageCode(Enum):
         "Check the profile's modes, and whether the drive changes modes while enabled.")
     REPORTS_CONTRADICT = (
         602, "Two reports of the drive contradict each other",
-        "Speed, position and torque cannot all be true of one shaft.",
+        "The reported speed, position and torque cannot all be correct.",
         "Check the encoder, its coupling, and the torque signal.")
     STATE_LEFT = (
         603, "The drive left its state",
@@ -660,14 +660,14 @@ class MessageCode(Enum):
     DRIVE_RESTARTED = (
         604, "The drive restarted during the run",
         "The drive sent its boot-up message in the middle of the run.",
-        "Check the supply of the drive. tdhil does not enable it again.")
+        "Check the power supply of the drive. tdhil does not enable it again.")
     FEEDBACK_NOT_FINITE = (
         605, "The feedback is not a number",
         "The drive reported a speed or torque that is not finite.",
         "Check the signal types in the profile.")
     NO_PLAUSIBLE_INERTIA = (
         606, "The speed ramp shows no plausible inertia",
-        "Torque and acceleration of the ramp do not fit to a rotating body.",
+        "Torque and acceleration of the ramp do not fit a rotating body.",
         "Check the torque signal, its scale and its sign.")
     ENABLE_FAILED = (
         607, "The drive did not become enabled",
@@ -709,11 +709,11 @@ class MessageCode(Enum):
         "Widen the limits in rig.yaml, or lower --amplitude.")
     SETPOINT_NOT_FOLLOWED = (
         708, "The shaft does not follow its setpoint",
-        "The speed or torque stays away from the command, often at an internal limit of the drive.",
-        "Check the limits inside the drive and the load.")
+        "The speed or torque does not reach its setpoint, often at an internal limit of the drive.",
+        "Check the load, and the limits inside the drive.")
     BRAKING_HELD_BACK = (
         709, "Braking torque was held back",
-        "The run may not brake with torque on this drive.",
+        "The run is not allowed to brake by torque on this drive.",
         "Choose a motion without braking torque.")
     DRIVE_TOO_HOT = (
         710, "The drive or motor is too hot",
@@ -721,7 +721,7 @@ class MessageCode(Enum):
         "Let it cool down. Lower --amplitude.")
     VIRTUAL_STRING_UNSTABLE = (
         711, "The loop of the virtual string is unstable",
-        "The lags of the rig are not those of the result.",
+        "The lags of the rig differ from those of the result.",
         "Identify again, and tune with the new result.")
     STEP_OVERSHOOTS = (
         712, "A step of the set speed overshoots far more than predicted",
@@ -745,12 +745,12 @@ class MessageCode(Enum):
         "Follow the advice beside the verdict, and check the signals.")
     TOO_FEW_LINES = (
         902, "Too few excited frequencies",
-        "The number of unknowns exceeds the number of equations from lines and mean speeds.",
+        "The excited frequencies and mean speeds give fewer equations than there are unknowns.",
         "Use --excitation multisine, or more mean speeds.")
     NO_EXCITATION = (
         903, "The motion does not show the inertia",
         "Speed or torque did not change enough, or the shaft only coasted.",
-        "Change the speed by torque several times, such as with --excitation multisine.")
+        "Change the speed by torque several times, for example with --excitation multisine.")
     SIGNAL_CLIPPED = (
         904, "A signal was limited or clipped",
         "Torque or speed stayed at a limit for a part of the record.",
@@ -781,11 +781,11 @@ class MessageCode(Enum):
         "Raise --offset, or lower --amplitude.")
     TOO_FEW_PERIODS = (
         911, "Too few usable periods",
-        "The scatter between periods needs more than the usable periods.",
+        "The scatter between periods needs more periods than are usable.",
         "Raise --periods or --max-time.")
     TOO_FEW_SAMPLES = (
         912, "Too few samples",
-        "The record is too short, or too slow for its excitation.",
+        "The record is too short, or its sample rate is too low for the excitation.",
         "Record longer, or with a higher --rate.")
     SPEED_SCALE_DOUBTFUL = (
         913, "Speed and angle contradict each other",
@@ -809,12 +809,12 @@ class MessageCode(Enum):
         "Check the pipe's diameters in rig.yaml, the rated torque and the speed unit.")
     SPEED_JUMPED = (
         918, "The reported speed jumped during the run",
-        "Within a tenth of a second it changed by more than torque and string can do to this shaft.",
+        "Within 0.1 s the speed changed by more than torque and string can cause.",
         "Check the encoder, its cable and its scale. Repeat the run.")
     SEVERITY_REFUSED = (
         925, "The record does not show the string's torsional motion",
-        "The record is too short or too slow, has too many gaps, or the string does not turn in it.",
-        "Name a longer record of rotation, with at least sixteen samples in each period of the string.")
+        "The record is too short, its sample rate is too low, it has too many gaps, or the string does not turn.",
+        "Use a longer record of rotation, with at least sixteen samples in each period of the string.")
 
     # --- 10xx: nothing readable in a file ----------------------------------------------------------------------------
     NOTHING_RECOVERABLE = (
@@ -828,12 +828,12 @@ class MessageCode(Enum):
     CSV_UNUSABLE = (
         1010, "The CSV trace is not usable",
         "The file holds no table of numbers with time, speed and torque in order.",
-        "Export the trace again, as CSV with one header.")
+        "Export the trace again, as CSV with one header line.")
 
     # --- 11xx: tuning refused ----------------------------------------------------------------------------------------
     TUNING_REFUSED = (
         1100, "These gains are not recommended",
-        "With the intervals of the result, the requested gains could make the string oscillate.",
+        "Within the intervals of the result, the requested gains could make the string oscillate.",
         "Choose values within the bounds that the message states.")
     NO_INERTIA_TO_TUNE = (
         1101, "The result has no inertia to tune for",
@@ -843,11 +843,11 @@ class MessageCode(Enum):
     # --- 12xx: rehearsal or acceptance not passed --------------------------------------------------------------------
     REHEARSAL_FAILED = (
         1200, "A rehearsed fault did not cause the required reaction",
-        "The run ended in another way than the fault table requires, or its interval misses the true inertia.",
+        "The run did not end as the fault table requires, or its interval misses the true inertia.",
         "Compare the required reaction with what was seen. A weaker fault may stay below what tdhil detects.")
     ACCEPTANCE_FAILED = (
         1201, "An identified value contradicts the expected one",
-        "The interval of the identified value and the tolerance of the expected one have no value in common.",
+        "The interval of the identified value does not overlap the tolerance of the expected value.",
         "Compare each row of the card. Correct the machine, or the expected value in rig.yaml.")
     EVIDENCE_FAILED = (
         1202, "An archive of evidence did not pass its check",

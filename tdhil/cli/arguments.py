@@ -139,7 +139,7 @@ def require_target(flag: str, path: Path, sources: Iterable[Path], source: str) 
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Add the options that select the drive. Return the group, to which a command may add more."""
     drive = add_options(parser, Topic.DRIVE)[Topic.DRIVE]
-    drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="the bench; needed to move anything real")
+    drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="file of the rig; required to move a real drive")
     return drive
 
 

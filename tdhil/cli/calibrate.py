@@ -29,12 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the kinds of calibration, with their options."""
     kinds = parser.add_subparsers(dest="kind", metavar="torque|speed", required=True)
     torque = kinds.add_parser(
-        "torque", allow_abbrev=False, help="by runs without and with a body of known inertia",
+        "torque", allow_abbrev=False, help="with bodies of known inertia, a torque sensor or a known pipe",
         description="Find the calibration factor of the drive's torque from a run without and a run with a body of"
         " known inertia on the shaft. More bodies are given with --body.")
     _add_torque(torque)
     speed = kinds.add_parser(
-        "speed", allow_abbrev=False, help="by counted turns, or by the position that the drive reports",
+        "speed", allow_abbrev=False, help="with counted turns, or the position that the drive reports",
         description="Find the calibration factor of the drive's speed: from a log whose drive reports a position, or"
         " from turns of the shaft that an operator counted.")
     add_speed_arguments(speed)
@@ -54,16 +54,16 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
                         " reported_nm, reported_sd_nm, reference_nm, reference_sd_nm and direction (up or down); a log"
                         " beside it names the drive")
     parser.add_argument("--reference", type=Path, metavar="trace.csv",
-                        help="record of a torque sensor during the run of one log; the time offset is found")
+                        help="record of a torque sensor during the run of one log; the time offset is estimated")
     parser.add_argument("--column", nargs="+", metavar="QUANTITY=NAME:UNIT",
                         help="its columns, such as time=t_s torque=m:Nm; default: time_s torque_nm")
     parser.add_argument("--reference-sd", type=share, metavar="SHARE",
                         help="standard uncertainty of the sensor's scale (default 0.3 %%: accuracy class 0.5)")
     parser.add_argument("--known-pipe", type=Path, metavar="string.yaml",
-                        help="sizes and tolerances of the pipe below the drive, in the run of one log: its resistance"
-                        " to waves is known from them")
+                        help="sizes and tolerances of the pipe below the drive, in the run of one log: its"
+                        " characteristic impedance follows from them")
     parser.add_argument("--at", choices=("motor", "main"), default="motor",
-                        help="shaft that the inertia, or the torque of --reference, is given at; main: behind the gear"
+                        help="shaft to which the inertia, or the torque of --reference, refers; main: behind the gear"
                         " (default motor)")
     add_option(parser, OPTION["confidence"])
     parser.add_argument("--plan", action="store_true",

@@ -23,7 +23,7 @@ def add_calibrate_arguments(section: argparse._ActionsContainer) -> None:
     """Add the options of a calibration by two runs."""
     hide_rare(
         section.add_argument("--calibrate", action="store_true",
-                             help="calibrate the torque: a run without a body, then a run with a body of --added"),
+                             help="calibrate the torque: a run without the body, then a run with the body of --added"),
         section.add_argument("--added", type=amount(INERTIA), metavar="J",
                              help="with --calibrate: inertia of the body at the motor shaft, kg·m²"),
         section.add_argument("--added-sd", type=amount(INERTIA), metavar="SD",

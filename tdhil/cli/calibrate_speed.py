@@ -31,14 +31,14 @@ def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the speed calibration. A default of None means: not given."""
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap",
                         help="a log whose drive reports a position; or, with --turns, the log of the counted turns")
-    parser.add_argument("--turns", type=float, metavar="N", help="turns of the shaft that were counted")
+    parser.add_argument("--turns", type=float, metavar="N", help="counted turns of the shaft")
     parser.add_argument("--turns-sd", type=float, metavar="SD",
                         help="standard uncertainty of the count (default 0.25 turns, assumed)")
     parser.add_argument("--seconds", type=amount(TIME), metavar="S", help="time in which they were counted, s")
     parser.add_argument("--seconds-sd", type=amount(TIME), metavar="SD",
                         help="standard uncertainty of the time (default 0.3 s, a stopwatch by hand, assumed)")
     parser.add_argument("--speed", type=amount(SPEED), metavar="W",
-                        help="mean speed that the drive reported meanwhile, rad/s; or 19.1rpm; at the motor")
+                        help="mean reported speed during the count, at the motor, rad/s, or such as 19.1rpm")
     parser.add_argument("--speed-sd", type=amount(SPEED), metavar="SD",
                         help="its standard uncertainty (default 0.1 %% of it, assumed)")
     parser.add_argument("--from", type=amount(TIME), metavar="S", help="time of the log at which the count began, s")
@@ -49,7 +49,7 @@ def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--want", type=share, default=0.01, metavar="SHARE",
                         help="largest half-width of the factor; a wider result is refused (default 1 %%)")
     parser.add_argument("--save", type=Path, metavar="calibration.json",
-                        help="where the result goes: a new file, or one that holds a torque calibration of this drive")
+                        help="file for the result: a new one, or one that holds a torque calibration of this drive")
     add_option(parser, OPTION["json"])
     add_report_option(parser, "report")
     add_head_options(parser)

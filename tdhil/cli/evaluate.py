@@ -18,12 +18,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--virtual-string", type=Path, required=True, metavar="string.yaml",
                       help="drill string, bottom and bit (docs/reference/string.md), simulated in this host")
     what.add_argument("--controller", type=Path, required=True, metavar="tune.json",
-                      help="what tdhil tune --json wrote for that string: the speed controller, run in this host")
+                      help="result of tdhil tune --json for that string; its speed controller runs in this host")
     what.add_argument("--use", choices=CONTROLLERS, default="soft", help="controller in that file (default soft)")
     what.add_argument("--own-loop", action="store_true",
-                      help="the drive's own speed loop, with these gains set in the drive; the string's torque "
-                           "goes through "
-                      "its torque offset")
+                      help="use the drive's own speed loop, with these gains set in the drive; the string's torque "
+                           "enters as its torque offset")
     what.add_argument("--result", type=Path, metavar="result.json",
                       help="result of tdhil identify on the present rig, if it is not the machine that was tuned for")
     what.add_argument("--dry-run", action="store_true",

@@ -31,7 +31,7 @@ _LARGEST_STANDARD: Final = 0x7FF
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of export."""
-    parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of a run, whole or cut short")
+    parser.add_argument("log", type=Path, metavar="run.mcap", help="log of a run, complete or cut short")
     parser.add_argument("--to", required=True, choices=tuple(SUFFIXES), help="candump and asc: the raw CAN frames, as "
                         "can-utils and CANalyzer read them; csv and parquet: every sample with its command, SI units")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: the log's name with another ending")

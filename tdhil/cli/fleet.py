@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_settings(parser)
     where = parser.add_mutually_exclusive_group()
     _add_jobs(where)
-    where.add_argument("--scheduler", metavar="tcp://HOST:8786", help="a Dask cluster instead (extra `cluster`)")
-    parser.add_argument("--again", action="store_true", help="identify all logs, also those that are finished")
+    where.add_argument("--scheduler", metavar="tcp://HOST:8786", help="use a Dask cluster instead (extra `cluster`)")
+    parser.add_argument("--again", action="store_true", help="identify all logs again, finished ones too")
     parser.add_argument("--retry-failed", action="store_true", help="retry logs that failed")
     parser.set_defaults(run=run)
 
@@ -45,7 +45,7 @@ def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE", help="the table (default: DIR/fleet.csv)")
     _add_settings(parser)
     _add_jobs(parser)
-    parser.add_argument("--every", type=amount(TIME), default=2.0, metavar="S", help="how often it looks (default 2 s)")
+    parser.add_argument("--every", type=amount(TIME), default=2.0, metavar="S", help="polling interval (default 2 s)")
     parser.add_argument("--once", action="store_true", help="check once, then end")
     parser.set_defaults(run=run_watch)
 
@@ -53,16 +53,16 @@ def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "each run's")
     parser.add_argument("--time-limit", type=amount(TIME), default=120.0, metavar="S",
-                        help="time limit for one log; a log above it twice is set aside (default 120 s)")
+                        help="time limit for one log; a log that exceeds it twice is set aside (default 120 s)")
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
                         help="memory limit for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
     add_left_out(parser)
-    add_option(parser, OPTION["json"], help="the summary as one JSON document on stdout")
+    add_option(parser, OPTION["json"], help="print the summary as one JSON document on stdout")
 
 
 def _add_jobs(group: Any) -> None:
-    group.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: the processor's cores)")
+    group.add_argument("--jobs", type=int, metavar="N", help="parallel processes (default: one per processor core)")
 
 
 def run(namespace: argparse.Namespace) -> int:

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="logs of runs with a periodic excitation, or traces in CSV; several are drawn together")
     add_option(parser, OPTION["json"])
     parser.add_argument("--out", type=Path, metavar="FILE",
-                        help="the lines as a table: frf.csv, or frf.parquet (extra `parquet`)")
+                        help="the excited frequencies as a table: frf.csv, or frf.parquet (extra `parquet`)")
     parser.add_argument("--plot", type=Path, metavar="FILE",
                         help="magnitude, phase, apparent inertia, residuals and coherence as frf.png, frf.svg or "
                         "frf.pdf")

@@ -46,7 +46,7 @@ _GROUPS: Final = {
         "export": "write a log's CAN frames or samples in another format",
         "recover": "show what a damaged log holds, and write a clean copy",
         "evidence": "make or check an archive of a run on a real drive",
-        "support": "put a log and its surroundings into one archive",
+        "support": "pack a log and support data into one archive",
     },
     "prepare": {
         "doctor": "check adapter, permissions, bus, computer, profile, drive",
@@ -56,7 +56,7 @@ _GROUPS: Final = {
         "calibrate": "compute the scale of torque or speed from known quantities",
     },
     "use J": {
-        "tune": "compute gains: of the speed loop, or against stick-slip",
+        "tune": "compute gains for the speed loop, or against stick-slip",
         "evaluate": "test a tuned controller on the drive with a virtual string",
         "severity": "show stick-slip in a record of ordinary drilling",
     },

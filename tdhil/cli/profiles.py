@@ -143,8 +143,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add `tdhil profiles`, `… show NAME`, `… check FILE`, `… import FILE`."""
     add_option(parser, OPTION["json"])
     actions = parser.add_subparsers(dest="action", metavar="ACTION")
-    shown = actions.add_parser("show", help="everything that is needed at the drive, of one profile",
-                                description="Everything that is needed at the drive, of one profile. A vendor's name "
+    shown = actions.add_parser("show", help="show the settings that one profile needs at the drive",
+                                description="Show the settings that one profile needs at the drive. A vendor's name "
                                             "lists the profiles for that vendor's drives.")
     shown.add_argument("name", metavar="NAME", help="vendor/model or the beginning of it, a vendor, or a .yaml file")
     checked = actions.add_parser("check", help="check your own profile; exit 2 and one line per problem",
@@ -158,7 +158,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="the profile (default: named as the EDS, in this folder); none is overwritten")
     for action in (shown, checked, begun):
         action.add_argument("--json", action="store_const", const=True, default=argparse.SUPPRESS,
-                            help="one JSON document on stdout")
+                            help="print one JSON document on stdout")
     parser.set_defaults(run=run)
 
 

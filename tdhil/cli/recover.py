@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of recover."""
     parser.add_argument("log", type=Path, metavar="broken.mcap", help="the log of a run that was cut short or damaged")
     parser.add_argument("-o", "--output", type=Path, metavar="whole.mcap",
-                        help="write what can be read as a finished log; the damaged one is never overwritten")
+                        help="write the readable part as a finished log; the damaged one is never overwritten")
     add_option(parser, OPTION["json"])
     parser.set_defaults(run=run)
 

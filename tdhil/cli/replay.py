@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of replay. A default of None means: not given."""
     # optional for argparse only: after --columns it takes the name of the file as another column (`_log`)
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
-                        help="the log of a run, whole or cut short, or a trace in CSV; recognised by their content")
+                        help="log of a run, complete or cut short, or a trace in CSV; recognised by its content")
     add_option(parser, OPTION["json"])
     add_report_option(parser, "report")
     add_head_options(parser, texts=[OPTION[name] for name in STATED])

@@ -26,7 +26,7 @@ _LETTERHEAD: Final = OPTION["letterhead"]
 def add_report_option(section: argparse._ActionsContainer, name: str) -> None:
     """Add ``--report``; ``name``: name of the file without its ending, as an example."""
     section.add_argument(FLAG, type=Path, metavar="FILE",
-                         help=f"the result with pictures in one file: {name}.html, or {name}.pdf on A4")
+                         help=f"the result with graphs in one file: {name}.html, or {name}.pdf on A4")
 
 
 def add_head_options(

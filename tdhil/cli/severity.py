@@ -32,14 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="run.mcap|trace.csv",
                         help="torque and speed of the top drive during rotation: a log, or a trace in CSV")
     parser.add_argument("--result", type=Path, required=True, metavar="result.json|run.mcap",
-                        help="result of tdhil identify for this top drive: J, and the lags of its reports")
+                        help="result of tdhil identify for this top drive: J, and the lags of its reported signals")
     parser.add_argument("--string", type=Path, metavar="string.yaml",
                         help="drill string (reference/string.md); without it, k and J_L of the result are used")
     parser.add_argument("--against", type=Path, metavar="LATER",
                         help="a second record, for example after tuning: both are shown side by side")
     parser.add_argument("--controller", type=Path, metavar="tune.json",
-                        help="what tdhil tune --json wrote: checks that the last record has the reflection of these "
-                             "gains")
+                        help="result of tdhil tune --json: checks that the reflection in the last record is that of "
+                             "these gains")
     parser.add_argument("--use", choices=CONTROLLERS, default="soft", help="controller in that file (default soft)")
     add_option(parser, OPTION["json"])
     add_report_option(parser, "severity")

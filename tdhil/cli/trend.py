@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of compare."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
-                        help="two or more; each is compared with the first")
+                        help="two or more logs; each is compared with the first")
     add_settings(parser, "each run's")
     _add_output(parser, "from the logs")
     parser.set_defaults(run=run_compare)

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " and gain margin over the intervals of J, friction and lags. Nothing is written into a drive.")
     tune_speed.add_arguments(speed)
     verify = purposes.add_parser(
-        "verify", allow_abbrev=False, help="small steps on the drive, beside the prediction of tune speed",
+        "verify", allow_abbrev=False, help="compare small steps on the drive with the prediction of tune speed",
         description="Step the set speed of the drive up and down, and compare overshoot, rise time, settling time, P"
         " and I with the prediction of tdhil tune speed. The shaft turns: limits, guard, confirmation and stop are"
         " those of tdhil identify.")

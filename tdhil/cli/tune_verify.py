@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("tuning", type=Path, metavar="tune.json", help="document of tdhil tune speed --json")
     what = parser.add_argument_group("verification")
     what.add_argument("--use", choices=GAINS, default="tuned",
-                      help="gains in that file that the drive has now (default tuned)")
+                      help="gains of that file that are set in the drive now (default tuned)")
     what.add_argument("--dry-run", action="store_true",
                       help="plan the steps within the rig's limits, or report what prevents them; nothing moves")
     add_report_option(what, "verify")

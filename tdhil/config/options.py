@@ -226,7 +226,7 @@ class RunOptions:
     )
     node: int | None = option(
         "--node", "node", group=Topic.DRIVE, common=True, metavar="N", ge=1, le=127, unset="the profile's",
-        help="CANopen node number (default: {default})", more="CANopen node number of the drive, 1 to 127",
+        help="CANopen node-ID (default: {default})", more="CANopen node-ID of the drive, 1 to 127",
     )
     profile: str = option(
         "--profile", "profile", "generic/cia402", group=Topic.DRIVE, common=True, metavar="NAME", beside_rig=True,
@@ -264,12 +264,13 @@ class RunOptions:
     frequency_hz: float | None = option(
         "--frequency", "run.frequency_hz", group=Topic.MOTION, unit=FREQUENCY, metavar="HZ", api=True, unset="planned",
         form=Form("Lowest excited frequency, Hz", ("acquire",)),
-        ge=1e-6, le=1e4, help="lowest excited frequency, or the tone", more="the lowest excited frequency, or the tone",
+        ge=1e-6, le=1e4, help="lowest excited frequency, or that of the sine",
+        more="the lowest excited frequency, or that of the sine",
     )
     amplitude_rad_s: float | None = option(
         "--amplitude", "run.amplitude_rad_s", group=Topic.MOTION, common=True, unit=SPEED, metavar="RAD_S", api=True,
         unset="planned", form=Form("Amplitude of the speed", ("acquire",)), ge=1e-9, le=1e5,
-        help="peak of the speed, such as 1.5 or 15rpm", more="amplitude of the speed",
+        help="amplitude about the mean speed, such as 1.5 or 15rpm", more="amplitude of the speed",
     )
     offset_rad_s: float | None = option(
         "--offset", "run.offset_rad_s", group=Topic.MOTION, common=True, unit=SPEED, metavar="RAD_S", api=True,
@@ -283,9 +284,10 @@ class RunOptions:
     )
     realisations: int = option(
         "--realisations", "run.realisations", 1, group=Topic.MOTION, metavar="N", api=True, ge=1, le=8,
-        form=Form("Sets of phases of the multisine", ("acquire",)),
-        help="sets of phases of the multisine at each mean speed (1); 2 or more measure nonlinear distortion",
-        more="sets of phases of the multisine at each mean speed. With 2 or more, the frequency response measures the "
+        form=Form("Phase sets of the multisine", ("acquire",)),
+        help="phase sets of the multisine at each mean speed (default {default}); 2 or more measure nonlinear "
+             "distortion",
+        more="phase sets of the multisine at each mean speed. With 2 or more, the frequency response measures the "
              "[nonlinear distortion](../how-to/read-the-frequency-response.md) of the excited lines themselves; each "
              "set settles anew",
     )
@@ -308,9 +310,9 @@ class RunOptions:
     )
     impedance: Literal["offset", "reference"] | None = option(
         "--impedance", "run.impedance", group=Topic.MOTION,
-        help="measure the drive's own impedance in its speed loop, with its torque offset or its speed reference",
-        more="measure [the drive's own impedance](../explanation/soft-torque.md#the-drives-own-impedance) in its "
-             "speed loop, with its torque offset or its speed reference",
+        help="measure the drive's own impedance in speed control, excited by its torque offset or its speed reference",
+        more="measure [the drive's own impedance](../explanation/soft-torque.md#the-drives-own-impedance) in "
+             "speed control, excited by its torque offset or its speed reference",
     )
     string_impedance_nm_s_rad: float | None = option(
         "--string-impedance", "run.string_impedance_nm_s_rad", group=Topic.MOTION, unit=FRICTION, metavar="NMS",
@@ -332,7 +334,7 @@ class RunOptions:
     )
     seed: int | None = option(
         "--seed", "run.seed", group=Topic.SIMULATED, metavar="N", api=True, ge=0, le=2**63 - 1,
-        form=Form("Seed (the same seed repeats a run)", ("simulated",), hint="drawn"), unset="random, and printed",
+        form=Form("Seed (the same seed repeats a run)", ("simulated",), hint="random"), unset="random, and printed",
         help="seed of a simulated run; the same seed repeats it",
     )
     simulate: bool = option(
@@ -357,7 +359,7 @@ class RunOptions:
     )
     json: bool = option(
         "--json", "run.json", False, group=Topic.OUTPUT, common=True, python=False,
-        help="print one JSON document on stdout", more="print one JSON document on stdout, and nothing else there",
+        help="print one JSON document on stdout", more="print one JSON document on stdout, and nothing else",
     )
     log: str = option(
         "--log", "run.log", "run.mcap", group=Topic.OUTPUT, common=True, metavar="run.mcap", is_file=True, min_length=1,
@@ -374,25 +376,24 @@ class RunOptions:
         "--simulated-torque-scale", "run.simulated_torque_scale", group=Topic.SIMULATED, unit=SHARE,
         metavar="RATIO", api=True,
         ge=0.1, le=10.0, unset="the plant's", form=Form("Torque scale of the drive", ("simulated",), hint="exact"),
-        help="torque in the simulated drive's own unit over true torque, such as 1.05; the identification does not "
-             "know it",
-        more="torque in the embedded drive's own unit over true torque (`1.05`: the drive reports 5 % too much); over "
-             "`reporting.torque_scale` of the plant. The identification does not know it",
+        help="ratio of the simulated drive's torque to the true torque, such as 1.05; unknown to the identification",
+        more="ratio of the embedded drive's torque to the true torque (`1.05`: the drive reports 5 % too much). It "
+             "replaces `reporting.torque_scale` of the plant, and is unknown to the identification",
     )
     simulated_speed_scale: float | None = option(
         "--simulated-speed-scale", "run.simulated_speed_scale", group=Topic.SIMULATED, unit=SHARE,
         metavar="RATIO", api=True,
         ge=0.1, le=10.0, unset="the plant's", form=Form("Speed scale of the drive", ("simulated",), hint="exact"),
-        help="speed in the simulated drive's own unit over true speed, such as 1.01; its position counts true turns",
-        more="speed in the embedded drive's own unit over true speed; over `reporting.speed_scale` of the plant. The "
-             "position counts true turns",
+        help="ratio of the simulated drive's speed to the true speed, such as 1.01; its position counts true turns",
+        more="ratio of the embedded drive's speed to the true speed. It replaces `reporting.speed_scale` of the "
+             "plant. The position counts true turns",
     )
     simulated_added_inertia_kg_m2: float | None = option(
         "--simulated-added-inertia", "run.simulated_added_inertia_kg_m2", group=Topic.SIMULATED,
         unit=INERTIA, metavar="J", api=True, ge=0.0, le=1e9, unset="the plant's",
         form=Form("Body bolted on, kg·m²", ("simulated",), hint="none"),
         help="body of known inertia on the simulated motor shaft, such as 55 (kg·m²)",
-        more="body of known inertia, at the motor, on the embedded rig's shaft, over `plant.added_inertia_kg_m2` "
+        more="body of known inertia on the motor shaft of the embedded rig. It replaces `plant.added_inertia_kg_m2` "
              "of the plant",
     )
     letterhead: str | None = option(
@@ -539,7 +540,7 @@ class TraceOptions(_Said):
     columns: tuple[str, ...] = option(
         "--columns", group=Topic.TRACE, default=(), metavar="QUANTITY=NAME:UNIT", api=True,
         unset="time_s speed_rad_s torque_nm",
-        help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%; default: {default}",
+        help="columns of the trace, such as time=t_s speed=n_rpm:rpm torque=m_pct:%; default: {default}",
     )
     excitation: str | None = option(
         "--excitation", group=Topic.TRACE, metavar="excitation.yaml", is_file=True, api=True, longest=20_000,
@@ -598,7 +599,7 @@ class TraceOptions(_Said):
     gear_ratio: float | None = option(
         "--gear", group=Topic.TRACE, metavar="RATIO", ge=1e-6, lt=1e6, api=True, unset="1",
         form=Form("Gear ratio, ω_motor/ω_main", ("trace",), hint="1"),
-        help="i = ω_motor/ω_main (default {default})",
+        help="gear ratio, ω_motor/ω_main (default {default})",
     )
     torque_scale_rel_sd: float | None = option(
         "--torque-scale-sd", group=Topic.TRACE, unit=SHARE, metavar="SHARE", ge=0, lt=1, api=True, unset="0.03",
@@ -613,7 +614,7 @@ class TraceOptions(_Said):
     speed_lag_sd_s: float | None = option(
         "--speed-lag-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a tenth of it",
         form=Form("Its standard uncertainty, s", ("trace",), hint="a tenth of it"),
-        help="its standard deviation (default {default})",
+        help="its standard uncertainty (default {default})",
     )
     torque_lag_s: float | None = option(
         "--torque-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True,
@@ -623,12 +624,13 @@ class TraceOptions(_Said):
     torque_lag_sd_s: float | None = option(
         "--torque-lag-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a tenth of it",
         form=Form("Its standard uncertainty, s", ("trace",), hint="a tenth of it"),
-        help="its standard deviation (default {default})",
+        help="its standard uncertainty (default {default})",
     )
     skew_sd_s: float | None = option(
         "--skew-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a sample, or 10 ms",
-        form=Form("Time offset between speed and torque, 1 sd, s", ("trace",), hint="a sample, or 0.01"),
-        help="time offset between speed and torque, 1 sd (default {default})",
+        form=Form("Standard uncertainty of the time offset between speed and torque, s", ("trace",),
+                  hint="a sample, or 0.01"),
+        help="standard uncertainty of the time offset between speed and torque (default {default})",
     )
 
 

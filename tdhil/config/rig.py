@@ -173,9 +173,9 @@ class DriveData(DataModel):
         default=365.0, description="days; an older torque calibration is used with a warning"
     )
     speed_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported speed")
-    speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard uncertainty")
     torque_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported torque")
-    torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard uncertainty")
     reference_filter_s: NotNegative | None = Field(
         default=None, description="s; time constant of the drive's filter on its speed reference"
     )

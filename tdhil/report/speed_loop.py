@@ -181,7 +181,7 @@ def _warnings(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTu
     unlike = (off > _UNLIKE * shaft.half_rel) & (off > _UNLIKE_REL)
     if np.any(unlike):
         at = ", ".join(f"{hertz:.3g}" for hertz in shaft.hertz[unlike])
-        yield CodedText(f"The measured response differs from the shaft that was tuned for at {at} Hz, by up to "
+        yield CodedText(f"The measured response differs from the shaft model of the tuning at {at} Hz, by up to "
                         f"{100.0 * float(off[unlike].max()):.0f} %.", MessageCode.LOOP_UNLIKE_RESPONSE)
 
 
