@@ -135,7 +135,7 @@ class Result:
 
     @property
     def reason(self) -> str:
-        """Return the reason of the verdict, in words."""
+        """Return the reason for the verdict, in words."""
         return self.identification.reason
 
     @property

@@ -67,7 +67,7 @@ def acceptance_rows(acceptance: Part | None) -> list[tuple[str, str]]:
     if acceptance is None:
         return []
     return [("acceptance", acceptance["verdict"]), *((one["label"], one["text"]) for one in acceptance["quantities"]),
-            *(("off", with_code(one, acceptance["code"])) for one in acceptance["off"])]
+            *(("deviation", with_code(one, acceptance["code"])) for one in acceptance["off"])]
 
 
 SIGNATURE_LINE: Final = "______________________________"
@@ -85,7 +85,7 @@ def signature_rows(acceptance: Part) -> list[tuple[str, str]]:
             ("signed verdict", str(signed["verdict"])), ("remark", str(signed["remark"]) or "none"),
             ("SHA-256 of the log", str(signed["log_sha256"]))]
     if signed.get("problem"):
-        rows.append(("signature does not hold", str(signed["problem"])))
+        rows.append(("signature not valid", str(signed["problem"])))
     return [*rows, ("signature", SIGNATURE_LINE)]
 
 

@@ -49,7 +49,7 @@ WIDTH_IN = 7.0
 _COLOURS = {"valid": "green", "valid_wide": "yellow", "not_identifiable": "red", "model_rejected": "red"}
 _VERDICTS = {
     "valid": "valid: the repeatability is within the requested tolerance",
-    "valid_wide": "valid, but wide: the intervals hold, and the repeatability is wider than the tolerance",
+    "valid_wide": "valid, but wide: the repeatability exceeds the requested tolerance",
     "not_identifiable": "not identifiable: these data do not determine the inertia",
     "model_rejected": "model rejected: the data contradict every candidate model",
 }

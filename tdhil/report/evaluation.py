@@ -198,7 +198,7 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
 
 def _answer(document: Part) -> AnswerBox:
     verdict, critical, law = document["verdict"], document["critical_rpm"], document["controller"]
-    value = "No critical speed" if critical is None else f"The bit is freed from {critical['value']:.1f} rpm"
+    value = "No critical speed" if critical is None else f"The bit comes free from {critical['value']:.1f} rpm"
     gains = law["at_main_shaft"]
     line = (f"{law['kind']} controller, in {'the drive' if law['own_loop'] else 'the host'}: P = "
             f"{gains['gain_nm_s_rad']:.4g} N·m·s/rad, I = {gains['integral_nm_rad']:.4g} N·m/rad at the main shaft")
@@ -228,16 +228,17 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     loop, rig, law = document["loop"], document["rig_at_motor"], document["controller"]["at_main_shaft"]
     if document["bit"]:
         yield "bit", f"{document['bit']}: the results are valid for this bit only"
-    yield "meant", f"{document['meant_inertia_kg_m2']:.4g} kg·m² at the main shaft"
+    yield "tuned for", f"{document['meant_inertia_kg_m2']:.4g} kg·m² at the main shaft"
     if law["compensated_kg_m2"]:
         yield "inertia compensated", f"{law['compensated_kg_m2']:.4g} kg·m²"
-    yield "turned", (f"{rig['inertia_kg_m2']:.4g} kg·m² at the motor, gear {rig['gear_ratio']:g}, the reported speed "
-                     f"{rig['speed_lag_s']:.3g} s late; torques scaled by {loop['scale']:.3g}")
+    yield "real machine", (
+        f"{rig['inertia_kg_m2']:.4g} kg·m² at the motor, gear {rig['gear_ratio']:g}, the reported speed "
+        f"{rig['speed_lag_s']:.3g} s late; torques scaled by {loop['scale']:.3g}")
     yield "torque limit", ("never acted" if not loop["clamped_cycles"] else
                            f"acted in {loop['clamped_cycles']} cycles: the string's torque was cut off")
     yield "torque without a command", f"{loop['unknown_rms_nm']:.0f} N·m rms"
     yield "energy by the loop's own errors", f"{loop['put_in_j']:.0f} J at most"
-    yield "reported speed beside the observer's", f"{loop['innovation_rms_rad_s']:.2g} rad/s rms"
+    yield "reported less observed speed", f"{loop['innovation_rms_rad_s']:.2g} rad/s rms"
 
 
 def _run(document: Part, sha256: str) -> Iterator[tuple[str, str]]:

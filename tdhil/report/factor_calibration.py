@@ -203,7 +203,7 @@ def _alignment(document: Part) -> Iterator[tuple[str, str]]:
                           f" {1.0 / (2.0 * math.pi * found['average_s']):.2g} Hz")
     slower = "reference" if found["filter_s"] > 0.0 else "reported torque"
     yield "filters", f"the {slower} is the slower, by a time constant of {abs(found['filter_s']):.2g} s"
-    yield "samples", (f"{found['samples']} averages in {found['overlap_s']:.0f} s, as good as"
+    yield "samples", (f"{found['samples']} averages in {found['overlap_s']:.0f} s, equivalent to"
                       f" {found['effective_samples']:.0f} independent ones")
 
 
@@ -252,8 +252,8 @@ _METHODS = {
     PAIRS: (
         "Reported torque R and torque T of a reference sensor were noted in pairs, each with its standard"
         " uncertainty. The line T = κ R + a was fitted with errors in both (York 2004). If the pairs scatter by more"
-        " than they are stated to, all uncertainties are enlarged in proportion. Half of the hysteresis between rising"
-        " and falling torque is a rectangular error. Evaluation of uncertainty: JCGM 100 (GUM)."
+        " than their stated uncertainties, all of these are enlarged in proportion. Half of the hysteresis between"
+        " rising and falling torque has a rectangular distribution. Evaluation of uncertainty: JCGM 100 (GUM)."
     ),
     REFERENCE: (
         "Reported torque R and torque T of a reference sensor were recorded during one run. The time offset is that"
@@ -269,7 +269,8 @@ _METHODS[KNOWN_PIPE] = (
     "A drill string of known sizes hangs on the shaft. The run was fitted with a string whose impedance ζ was free, in"
     " the drive's unit of torque, and whose travel time T was measured with it. κ is ζ T^(−e) of the stated sizes over"
     " the measured one; the exponent e is the one with the least uncertainty for the stated tolerances (−1: the"
-    " string's inertia, 0: its impedance). Tolerances are rectangular. Evaluation of uncertainty: JCGM 100 (GUM)."
+    " string's inertia, 0: its impedance). Tolerances have rectangular distributions. Evaluation of uncertainty:"
+    " JCGM 100 (GUM)."
 )
 _RESULT_NOTE = (
     "The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"

@@ -40,7 +40,7 @@ GRAPHS = {
     "lines": Graph(
         "Torque over acceleration at each excited frequency",
         "the curve passes through the points, and the residuals are about 1",
-        "many residuals exceed 3 (check the stated lags), or the points rise steeply or change their sign (look for a "
+        "many residuals exceed 3 (check the stated lags), or the points rise steeply or change sign (look for a "
         "resonance)"),
     "response": Graph(
         "Frequency response",
@@ -96,7 +96,7 @@ GRAPHS = {
         "a cross lies off its curve, or a depth is missing (use a smaller step of depth, and read the sentence above)"),
     "string_close": Graph(
         "Evaluation on a virtual string",
-        "the bit turns on after a few oscillations that decay",
+        "the bit keeps turning, and its oscillation decays",
         "the bit stops again and again (the set speed is below the critical speed), or the oscillation does not decay "
         "(compare the gains)"),
     "string_course": Graph(
@@ -113,7 +113,7 @@ GRAPHS = {
         "the index lies above the upper, red line (raise the set speed, lower the weight on bit, or tune soft torque)"),
     "bodies": Graph(
         "Calibration: bodies",
-        "the line passes through all runs within their bars",
+        "the line passes through the error bars of all runs",
         "a run lies off the line (check the inertia of this body and its bolts)"),
     "pairs": Graph(
         "Calibration: pairs of torque",
@@ -122,7 +122,7 @@ GRAPHS = {
         "bend (use a smaller range)"),
     "sensor": Graph(
         "Calibration: record of a reference sensor",
-        "the curves lie on each other but for the scale, and the residuals look like noise",
+        "the curves differ by the scale only, and the residuals look like noise",
         "the residuals drift or look like the motion (check the clock, the column and the place of the sensor)"),
     "linearity": Graph(
         "Calibration: linearity",
@@ -130,15 +130,15 @@ GRAPHS = {
         "the band has a slope, a curve or a kink (the scale changes with the torque: calibrate in the range of use)"),
     "trend": Graph(
         "Trend of a rig",
-        "the points scatter by their intervals about a constant value",
-        "the points have a step or a drift (look at what was changed on the machine at that date)"),
+        "the points scatter about a constant value, within their intervals",
+        "the points have a step or a drift (look for a change on the machine at that date)"),
     "compare": Graph(
         "Comparison of runs",
-        "the points of all runs lie on each other",
+        "the points of all runs coincide",
         "they differ at high frequencies only (the drive's filters changed), or everywhere (the inertia changed)"),
     "friction_compare": Graph(
         "Comparison of runs",
-        "the points of all runs lie on each other",
+        "the points of all runs coincide",
         "they differ at all speeds (compare temperature, brake, bearings and seals), or more at high speed (compare "
         "lubricant and fan)"),
 }

@@ -58,8 +58,8 @@ def settings_section(settings: Iterable[tuple[str, str, str]], step: str) -> Rep
     """
     return ReportSection("To be typed into the drive, by hand", (
         Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
-        Text(f"Nothing here was written into any drive. Change one {step} at a time, at a low speed, with the "
-             "hard-wired stop in reach."),
+        Text(f"Nothing here was written to any drive. Change one {step} at a time, at a low speed, with the "
+             "hard-wired stop within reach."),
     ))
 
 

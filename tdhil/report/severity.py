@@ -161,7 +161,7 @@ def _episodes(one: Part) -> str:
 def _period(one: Part) -> str:
     part = one["period_s"]
     if part is None:
-        return "nothing that repeats"
+        return "no periodic oscillation"
     return f"every {_with(part, 2, ' s')}, {1.0 / part['value']:.3f} Hz, {one['cycles']} cycles"
 
 

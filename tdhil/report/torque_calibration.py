@@ -181,7 +181,7 @@ _ROUNDING = 1e-9
 def _picture(document: Part) -> Block:
     return Picture("bodies", partial(draw_calibration, document=document), 4.2,
                    "Identified over known added inertia, in the drive's unit of torque; the line, its 95 % band, and"
-                   " what it leaves.")
+                   " the residuals.")
 
 
 def draw_calibration(figure: FigureBase, document: Part) -> None:

@@ -66,7 +66,7 @@ JUMPING_BIT_ERROR_SHARE = 0.18
 107.5 rpm with ticks of 1.5 to 6 ms; a chain with 9 masses in the collars 122 rpm, with 18 masses 127 rpm."""
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _MEANT = {
-    "cure": "lowest set speed at which a stuck bit comes free and turns on, the top at full speed",
+    "cure": "lowest set speed that frees a stuck bit and keeps it turning, the top at full speed",
     "start": "lowest set speed at which the bit turns after a ramp from standstill",
 }
 

@@ -97,7 +97,7 @@ def print_verification(document: Part, console: PlainConsole) -> None:
         for name, measured, predicted, said in _table(document):
             grid.add_row(name, measured, predicted, Words(said, style="bold red" if said == "differs" else ""))
         console.print(grid)
-        console.print(Words("The measured intervals hold together with 95 %.", style="dim"))
+        console.print(Words("The measured intervals have a joint coverage of 95 %.", style="dim"))
 
 
 def _rows(document: Part) -> Iterator[tuple[str, str]]:

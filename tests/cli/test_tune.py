@@ -214,7 +214,7 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     written = write_blocks(tuning_report(document, showcase), tmp_path / "tune.html")
     text = written.read_text(encoding="utf-8")
     assert text.count("<svg") == 3
-    assert "SIMULATED" in text and "a stuck bit comes free and turns on" in text
+    assert "SIMULATED" in text and "frees a stuck bit and keeps it turning" in text
     assert write_blocks(tuning_report(document, None), tmp_path / "tune.pdf").read_bytes().startswith(b"%PDF")
 
 

@@ -175,4 +175,5 @@ def test_the_map_in_words_is_that_of_its_cells():
     lines = [" ".join(line.split()) for line in shown_by(print_map, found).splitlines()]
     assert [line for line in lines if "kN·m" in line] == [
         "2.5 kN·m stable from 80 rpm, stick-slip up to 20", "3 kN·m not stable up to 80 rpm, stick-slip up to 40"]
-    assert "Yellow: The bit goes on turning" in found["how_to_read"]
+    assert "Yellow: The bit keeps turning" in found["how_to_read"]
+    assert ".." not in found["how_to_read"]

@@ -336,9 +336,9 @@ def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path,
     rows = dict(signature_rows(_signed(document)["acceptance"]))
     assert rows["signed by"] == "Anna (engineer, account anna)" and rows["SHA-256 of the log"] == digest
     assert rows["date"] == "2026-05-01 12:30:00 UTC"
-    assert "signature does not hold" not in rows and set(rows["signature"]) == {"_"}
+    assert "signature not valid" not in rows and set(rows["signature"]) == {"_"}
     (tmp_path / "run.mcap").write_bytes(b"other")
-    assert "another one" in dict(signature_rows(_signed(document)["acceptance"]))["signature does not hold"]
+    assert "another one" in dict(signature_rows(_signed(document)["acceptance"]))["signature not valid"]
     assert [name for name, _ in signature_rows(ACCEPTANCE)] == ["accepted by"]
 
 
