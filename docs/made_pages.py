@@ -290,7 +290,7 @@ The body of an error has the keys of the [errors](python/errors.md): `kind`, `me
 | 408, to an upload | the upload is too slow |
 | 413 | the uploaded file is larger than the limit |
 | 429 | too many requests; `Retry-After` says when to try again |
-| 504, to a stop | the process of the run does not react; the body says what the service does |
+| 504, to a stop | the process of the run does not respond; the body says what the service does |
 | 507 | the disk is full; no run starts |
 
 `WS /api/v1/live/<run>` sends a run from its start: `hello`, then `news` with samples (thinned to 25 a second), events,

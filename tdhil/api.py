@@ -71,8 +71,8 @@ class Motion:
 class Multisine(Motion):
     """Several tones at once, with a low crest factor: the default. None: chosen to fit the rig.
 
-    ``frequency_hz``: lowest excited frequency; ``amplitude_rad_s``: peak of the speed; ``offset_rad_s``: mean speed;
-    ``periods``: number at each mean speed, including those for settling.
+    ``frequency_hz``: lowest excited frequency; ``amplitude_rad_s``: amplitude about the mean speed; ``offset_rad_s``:
+    mean speed; ``periods``: number at each mean speed, including those for settling.
     """
 
     kind: str = field(default="multisine", init=False)

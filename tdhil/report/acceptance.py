@@ -165,7 +165,7 @@ def _causes(rows: Sequence[Accepted]) -> Iterable[str]:
         (first, half), *others = ratios.values()
         if all(abs(ratio - first) <= sqrt(width**2 + half**2) and width < abs(ratio - 1.0) + half
                for ratio, width in others):
-            yield (f"everything that comes from the torque is {ratios['inertia'][0]:.3g} times the expected value: "
+            yield (f"all values that come from the torque are {ratios['inertia'][0]:.3g} times the expected ones: "
                    "another torque scale, another rated torque, or another drive")
             failed = [one for one in failed if one.name not in _WITH_TORQUE]
     for one in failed:
@@ -188,7 +188,7 @@ _HINTS: Final = {
     "drive-serial": ": another drive",
     "drive-name": ": another drive",
     "profile": ": another profile was chosen",
-    "torque-limit": ": the drive or rig.yaml limits the torque elsewhere",
+    "torque-limit": ": the drive or rig.yaml has another torque limit",
 }
 
 

@@ -485,7 +485,7 @@ def _grounds(document: Part, recording: Recording, sha256: str) -> Iterator[tupl
     yield "model", document["model"]
     if (inertia := document["inertia_kg_m2"]) is not None:
         yield "the repeatability is conditional on", "; ".join(inertia["conditional_on"])
-        yield "confidence of every interval", f"{100.0 * inertia['confidence']:g} %"
+        yield "coverage of every interval", f"{100.0 * inertia['confidence']:g} %"
     yield "torque scale, 1 sd", f"{100.0 * recording.torque_scale_rel_sd:g} %"
     if document["reference_inertia_kg_m2"] is not None:
         yield "reference J (rig.yaml)", f"{document['reference_inertia_kg_m2']:g} kg·m²"

@@ -167,8 +167,8 @@ def _warnings(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTu
             "The lags of the speed loop are assumed, and they limit its gains. Measure them with tdhil identify "
             "--impedance, or state --inner-lags and --dead-time.", MessageCode.LOOP_LAGS_ASSUMED)
     if tuned_for.model.startswith("string"):
-        yield CodedText("The loop has the lowest mode of the string only. Use tdhil tune soft-torque for the string.",
-                        MessageCode.LOOP_ONE_MODE_ONLY)
+        yield CodedText("The loop contains only the lowest mode of the string. Use tdhil tune soft-torque for the "
+                        "string.", MessageCode.LOOP_ONE_MODE_ONLY)
     if shaft is None:
         return
     highest, bandwidth = float(shaft.hertz.max()), design.tuned.bandwidth_hz.value
@@ -196,7 +196,7 @@ def _sentence(design: LoopDesign) -> str:
              f"and {_number(tuned.worst.gain_db, 1)} dB in the worst case.")
     present = next((row for row in design.rows if row.kind == "present"), None)
     if present is not None and present.worst.stable:
-        said += f" The present gains have {present.bandwidth_hz.value:.3g} Hz and {present.worst.phase_deg:.0f}°."
+        said += f" The present gains give {present.bandwidth_hz.value:.3g} Hz and {present.worst.phase_deg:.0f}°."
     return said
 
 
@@ -208,8 +208,8 @@ def _notch_by_hand(notch: NotchFilter | None, tuned_for: LoopTunedFor) -> str | 
     said = f"Notch: frequency {notch.hertz:.3g} Hz{width}, depth {notch.depth_db:.3g} dB."
     if tuned_for.profile is None:
         return f"{said} The drive's notch is not known without a profile. Look up its parameters in the manual."
-    return (f"{said} The profile {tuned_for.profile} does not know the drive's notch. Look up its parameters in the "
-            "manual, or add --no-notch if the drive has none.")
+    return (f"{said} The profile {tuned_for.profile} does not describe the drive's notch. Look up its parameters in "
+            "the manual, or add --no-notch if the drive has none.")
 
 
 def _curves(curve: LoopCurve) -> dict[str, Any]:

@@ -122,7 +122,7 @@ def _sections(document: Part) -> Iterator[ReportSection]:
         yield ReportSection("Result", (_results(document), Text(
             "The expanded uncertainty U is the standard uncertainty multiplied by the coverage factor k for a coverage"
             f" probability of {100 * factor['confidence']:g} %. Of a calibrated torque, the share that comes from the"
-            " unit of speed is part of κ: κ is right for inertia and for torque over acceleration.")))
+            " unit of speed is part of κ: κ is valid for inertia and for torque over acceleration.")))
         rows = []
         for line in document["budget"]:
             dof, sd = line["degrees_of_freedom"], line["standard_uncertainty_kg_m2"]

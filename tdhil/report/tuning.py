@@ -112,9 +112,9 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     warnings, wide_hz = [*tuned_for.warnings], np.geomspace(0.02, 5.0, 300)
     if jumps:
         share = JUMPING_BIT_ERROR_SHARE
-        warnings.append("The friction of the bit falls more steeply with speed than the lowest section damps, so it"
-                        f" jumps from speed to speed. The critical speeds may be {100.0 * share:.0f} % too low. Take"
-                        " them as lower limits.")
+        warnings.append("The friction of the bit falls more steeply with speed than the lowest section damps, so the"
+                        f" bit jumps from speed to speed. The critical speeds may be {100.0 * share:.0f} % too low."
+                        " Take them as lower limits.")
     longest_s = longest_integral_time_s(tuning.string_modes_hz[0])
     for one in tuning.tuned:
         if one.controller is not None and search is not None and one.controller.integral_time_s > longest_s:
@@ -125,8 +125,8 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             over = reflection_at(case.drive, one.controller, string, wide_hz)
             if over.max() > 1.001:
                 warnings.append(
-                    f"{one.kind} sends back up to {over.max():.3f} of a wave at {wide_hz[int(over.argmax())]:.2g} Hz. "
-                    "There only the drag of mud and bit, as stated in string.yaml, keeps it stable.")
+                    f"{one.kind} reflects up to {over.max():.3f} of a wave at {wide_hz[int(over.argmax())]:.2g} Hz. "
+                    "There, only the drag of mud and bit, as stated in string.yaml, keeps it stable.")
     lags_moved = [[end.drive.total_lag_s for end in pair] for pair in case.moves(present=False)]
     return {
         "tuned_for": {
@@ -363,7 +363,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     if tuned_for.get("present_from"):
         yield "present gains", tuned_for["present_from"]
     if tuned_for["loop"] == "bus":
-        yield "loop", "closed over the bus, in torque mode: the reported speed's lag is in it"
+        yield "loop", "closed over the bus, in torque mode: the lag of the reported speed is included"
 
 
 def _figures(document: Part) -> list[str]:

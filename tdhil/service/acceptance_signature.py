@@ -39,9 +39,9 @@ class AcceptanceSignature:
     def problem(self, acceptance: Mapping[str, Any] | None, log_sha256: str) -> str:
         """Return why the signature does not hold for this acceptance and this log, in words; '' if it does."""
         if log_sha256 != self.log_sha256:
-            return "the log is another one than the signed one"
+            return "the log is not the signed one"
         if acceptance is None or hash_of(acceptance) != self.acceptance_sha256:
-            return f"the acceptance is another one than the signed one, whose verdict was {self.verdict}"
+            return f"the acceptance is not the signed one, whose verdict was {self.verdict}"
         return ""
 
 

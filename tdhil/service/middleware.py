@@ -177,7 +177,7 @@ async def body_of(request: Request, route: Route) -> Any:
         raise UsageError("must be an object", where="body", next_step='Send an object, such as {"seed": 7}',
                          entry=MessageCode.REQUEST_WRONG)
     if (where := _not_text(sent)) is not None:
-        raise UsageError("contains half of a UTF-16 surrogate pair, which is no character", where=where[:60] or "body",
+        raise UsageError("contains half of a UTF-16 surrogate pair, not a character", where=where[:60] or "body",
                          next_step="Nothing was changed. Enter the text again", entry=MessageCode.REQUEST_WRONG)
     if route.body in OBJECTS:
         return sent

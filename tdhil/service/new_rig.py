@@ -103,7 +103,7 @@ def draft_of(body: DraftBody) -> DraftView:
 def _profile(name: str) -> Profile:
     """Return a profile that ships. Raises UsageError: no path comes over HTTP."""
     if name not in profile_names():
-        raise UsageError("is no profile that ships", where="profile", next_step="See the list of profiles",
+        raise UsageError("is not a profile of tdhil", where="profile", next_step="See the list of profiles",
                          entry=MessageCode.REQUEST_WRONG)
     return load_profile(name)
 

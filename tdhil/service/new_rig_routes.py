@@ -39,7 +39,7 @@ async def scan_bus(site: Site, request: Request, body: DraftBody) -> ScanView:
     if not body.alone:
         raise ValuesWrong([("alone", "A scan requests data from every node. Confirm that no other master is active.")])
     if site.supervisor.turning():
-        raise Conflict("a real shaft turns, and a scan could disturb its bus", where="scan",
+        raise Conflict("a real shaft is turning, and a scan could disturb its bus", where="scan",
                        next_step="Scan when that run has ended")
     who = principal(request).name
     site.supervisor.note(who, "bus scanned", None, None, profile=body.profile, address=dict(body.address))

@@ -139,9 +139,9 @@ class RunRecords:
             request, where = self._store.request(run), f"run {run}"
             self._require_settled(run)
             if request.rehearsal:
-                raise Conflict("faults were rehearsed in this run: it is no acceptance of a rig", where=where)
+                raise Conflict("faults were rehearsed in this run: it can't be the acceptance of a rig", where=where)
             if request.uploaded is not None:
-                raise Conflict("this recording was uploaded: it is no acceptance of a rig", where=where)
+                raise Conflict("this recording was uploaded: it can't be the acceptance of a rig", where=where)
             present, digest = self.acceptance(run)
             if (before := self.signature(run)) is not None:
                 raise Conflict(f"the acceptance is signed already: by {before.name}, {before.at}", where=where,
@@ -150,7 +150,7 @@ class RunRecords:
                 raise Conflict(f"the verdict is {present.get('verdict')}, not {verdict[:20]}", where=where,
                                next_step="Load the page again", entry=MessageCode.CHANGED_MEANWHILE)
             if log_sha256 != digest:
-                raise Conflict("the log is another one than the page showed", where=where,
+                raise Conflict("the log is not the one that the page showed", where=where,
                                next_step="Load the page again", entry=MessageCode.CHANGED_MEANWHILE)
             wrong = []
             if not 1 <= len(name) <= LONGEST_NAME:

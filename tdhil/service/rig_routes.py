@@ -95,7 +95,7 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
         raise NotAllowed("only a simulated rig is measured from here", where=f"rig {found.id}",
                          next_step="A run on a real drive measures the rate itself, before motion")
     if site.supervisor.turning():
-        raise Conflict("a real shaft turns, and a measurement would take this computer's time", where=f"rig {found.id}",
+        raise Conflict("a real shaft is turning, and a measurement would load this computer", where=f"rig {found.id}",
                        next_step="Measure when that run has ended")
     asked = {"rig_file": str(found.path.resolve()), "options": {}}
     return PaceView(found.id, await site.work("pace", None, asked))
@@ -105,7 +105,7 @@ async def check_rig(site: Site, request: Request, body: Any) -> list[DoctorFindi
     """Check a rig's drive without motion. Raises Conflict while a real shaft may turn."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
     if site.supervisor.turning():
-        raise Conflict("a real shaft turns, and a check could disturb its bus", where=f"rig {found.id}",
+        raise Conflict("a real shaft is turning, and a check could disturb its bus", where=f"rig {found.id}",
                        next_step="Check when that run has ended")
     site.supervisor.note(principal(request).name, "rig checked", None, found.id)
     asked = {"rig_file": str(found.path.resolve()), "runs_folder": str(site.store.runs)}

@@ -78,7 +78,7 @@ async def runs_page(site: Site, request: Request, body: None) -> RunsPageView:
     if not page.isdecimal() or not 1 <= int(page) <= LAST_PAGE:
         raise UsageError(f"must be 1 to {LAST_PAGE}", where="page", entry=MessageCode.REQUEST_WRONG)
     if key not in SORTS or way not in ("asc", "desc"):
-        raise UsageError("names no order of a list", where="sort" if key not in SORTS else "order",
+        raise UsageError("is not a sort order of this list", where="sort" if key not in SORTS else "order",
                          next_step=f"Give sort={', '.join(SORTS)} and order=asc or desc",
                          entry=MessageCode.REQUEST_WRONG)
     return await off(lambda: site.runs_page(wanted, Order(key, way == "desc"), int(page)))

@@ -407,7 +407,7 @@ class Supervisor:
         done = ("The service ended the process and sends tdhil stop to the run's drive" if killed else
                 "The service could not end the process, and sends nothing to the drive")
         raise NotReacting(
-            "the run's process does not react: it is suspended, by SIGSTOP or a debugger."
+            "the run's process does not respond: it is suspended, by SIGSTOP or a debugger."
             f" The drive's watchdog{watchdog} stops the shaft. {done}", where=f"run {status.id}",
             next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired stop")
 
@@ -526,7 +526,7 @@ class Supervisor:
         try:
             write_new(path, text.encode())
         except FileExistsError:
-            raise Conflict("this rig exists already", where=f"rig {rig_id}", next_step="Choose another id") from None
+            raise Conflict("this rig already exists", where=f"rig {rig_id}", next_step="Choose another id") from None
         except OSError as error:
             raise LogError(f"the rig's file can't be written ({error.strerror or error})", where=path.name,
                            next_step="Check the folder of rig files") from error

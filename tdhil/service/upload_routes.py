@@ -61,8 +61,8 @@ async def upload(site: Site, request: Request, body: None) -> Upload:
     who, name = principal(request).name, request.query_params.get("name", "")
     media = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if media != MEDIA:
-        raise UsageError("must be the bytes of the file", where=f"content-type {media[:60]}", next_step=f"Use {MEDIA}",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise UsageError("must be the file itself, as raw bytes", where=f"content-type {media[:60]}",
+                         next_step=f"Use {MEDIA}", entry=MessageCode.REQUEST_WRONG)
     stated = request.headers.get("content-length", "")
     received = await off(lambda: site.uploads.begin(int(stated) if stated.isdecimal() else None))
     request.scope[ADMITTED] = True
@@ -86,7 +86,7 @@ async def _receive(request: Request, received: Receiving) -> None:
         except StopAsyncIteration:
             break
         except TimeoutError:
-            raise TooSlow(f"{size} bytes came in {HEADERS_S + size / SLOWEST:.0f} s, which is too slow",
+            raise TooSlow(f"{size} bytes arrived in {HEADERS_S + size / SLOWEST:.0f} s, which is too slow",
                           where="upload", next_step="Nothing was kept. Use a faster connection") from None
         size += len(piece)
         waiting += piece

@@ -250,7 +250,7 @@ class Uploads:
         with self._lock:
             found = self.get(upload)
             if found.state in BUSY or found.run is not None:
-                raise Conflict("this upload is identified already" if found.run else "this upload is being identified",
+                raise Conflict("this upload is already identified" if found.run else "this upload is being identified",
                                where=f"upload {upload}", next_step="Wait for its run")
             self._memory.states[upload] = ("identifying", None)
         return replace(found, state="identifying", error=None)

@@ -196,7 +196,7 @@ def test_without_parameters_of_its_own_a_notch_is_given_in_plain_units(tuned):
     said = document["notch_by_hand"]
     assert said.startswith(f"Notch: frequency 3 Hz, width {notch['width_hz']:.3g} Hz at −3 dB, depth "
                            f"{notch['depth_db']:.3g} dB.")
-    assert "The profile abb/acs880-enhanced does not know the drive's notch." in said
+    assert "The profile abb/acs880-enhanced does not describe the drive's notch." in said
     _, text, _ = tuned(compliant=COMPLIANT, frequency_response=None, as_json=False)
     words = " ".join(text.split())
     assert "Notch: frequency 3 Hz, width" in words and "The drive's notch is not known without a profile." in words

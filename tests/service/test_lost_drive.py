@@ -176,7 +176,7 @@ def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_wa
     pid = service.store.status(run).pid
     suspend(pid)
     told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
-    for words in ("does not react", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
+    for words in ("does not respond", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
         assert words in told["what"]
     assert "hard-wired stop" in told["next_step"]
     service.wait(run, "interrupted")
@@ -202,7 +202,7 @@ def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")
     suspend(service.store.status(run).pid)
-    assert "does not react" in call("POST", "/rigs/a/stop", 504, json={})["error"]["what"]
+    assert "does not respond" in call("POST", "/rigs/a/stop", 504, json={})["error"]["what"]
     service.wait(run, "interrupted")
 
 

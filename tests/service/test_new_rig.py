@@ -200,7 +200,7 @@ def test_a_scan_asks_first_and_shows_what_replied(call, service, monkeypatch):
                    "fields": {"node": "3"}}], "remarks": []}))})
     assert call("POST", "/new-rig/scan", 200, json=body | {"alone": True})["found"][0]["fields"] == {"node": "3"}
     monkeypatch.setattr(service.supervisor, "turning", lambda: True)
-    assert "shaft turns" in call("POST", "/new-rig/scan", 409, json=body | {"alone": True})["error"]["message"]
+    assert "shaft is turning" in call("POST", "/new-rig/scan", 409, json=body | {"alone": True})["error"]["message"]
 
 
 def test_the_scan_is_that_of_the_command_line(monkeypatch):
@@ -234,7 +234,7 @@ def test_no_rig_is_checked_while_a_real_shaft_may_turn(call, service, monkeypatc
     rig = call("GET", "/rigs", 200)[0]["id"]
     monkeypatch.setattr(service.supervisor, "work", lambda *asked: pytest.fail("nothing is opened"))
     monkeypatch.setattr(service.supervisor, "turning", lambda: True)
-    assert "shaft turns" in call("POST", f"/rigs/{rig}/check", 409, json={})["error"]["message"]
+    assert "shaft is turning" in call("POST", f"/rigs/{rig}/check", 409, json={})["error"]["message"]
 
 
 def test_the_check_is_that_of_the_command_line(monkeypatch, tmp_path):

@@ -200,10 +200,10 @@ def test_a_person_signs_the_verdict_and_the_log_once_and_the_audit_has_it(call, 
     result = service.store.place(run) / "result.json"
     before = result.read_bytes()
     write_json(result, {"acceptance": {**ACCEPTANCE, "quantities": []}})
-    assert "another one than the signed one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+    assert "the acceptance is not the signed one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
     result.write_bytes(before)
     log.write_bytes(log.read_bytes() + b"x")
-    assert "the log is another one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+    assert "the log is not the signed one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
 
 
 @pytest.mark.heavy(but_first=1)
@@ -221,7 +221,7 @@ def test_what_is_no_pass_is_signed_with_a_remark_only(call, service, verdict):
 def test_another_verdict_or_log_than_the_person_saw_is_refused_in_words(call, service):
     run, sent = accepted(call, service, "fail")
     for other, words in (({"verdict": "pass"}, "the verdict is fail, not pass"),
-                         ({"log_sha256": "0" * 64}, "another one than the page showed")):
+                         ({"log_sha256": "0" * 64}, "not the one that the page showed")):
         found = call("POST", f"/runs/{run}/acceptance", 409, json={**sent, "remark": "x", **other})["error"]
         assert words in found["message"] and "Load the page again" in found["message"]
     assert service.web.records.signature(run) is None and not noted(service, "acceptance signed")
@@ -338,7 +338,7 @@ def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path,
     assert rows["date"] == "2026-05-01 12:30:00 UTC"
     assert "signature not valid" not in rows and set(rows["signature"]) == {"_"}
     (tmp_path / "run.mcap").write_bytes(b"other")
-    assert "another one" in dict(signature_rows(_signed(document)["acceptance"]))["signature not valid"]
+    assert "not the signed one" in dict(signature_rows(_signed(document)["acceptance"]))["signature not valid"]
     assert [name for name, _ in signature_rows(ACCEPTANCE)] == ["accepted by"]
 
 

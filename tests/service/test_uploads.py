@@ -165,7 +165,7 @@ def test_an_identification_waits_until_no_real_shaft_turns(call, service, work, 
 
 
 @pytest.mark.parametrize(("data", "headers", "status", "said"), [
-    (TRACE, {"Content-Type": "text/plain"}, 422, "must be the bytes of the file"), (b"", {}, 422, "the file is empty"),
+    (TRACE, {"Content-Type": "text/plain"}, 422, "must be the file itself"), (b"", {}, 422, "the file is empty"),
     (TRACE, {"Content-Length": str(2**40)}, 413, "larger than the limit"),
 ])
 def test_what_is_no_upload_is_refused(call, service, data, headers, status, said):

@@ -405,7 +405,7 @@
     return async () => {             // a second request starts all the same
       if (!box.checked || warned || await (measuring ||= measure())) return true;
       warned = true;
-      where.append(` ${tr("Start again to run all the same.")}`);
+      where.append(` ${tr("Press Start again to run anyway.")}`);
       const closed = where.closest("details");
       if (closed) closed.open = true;
       where.scrollIntoView({ block: "center" });
@@ -484,7 +484,7 @@
       buttons.forEach((one) => { one.disabled = true; });
       unmark(form);
       const over = wanted === "plan" ? waiting(byId("said"), tr("Planning"), "plan") : () => {};
-      if (wanted === "plan") byId("plan").hidden = true; else show(byId("said"), el("p", { class: "dim" }, tr("Asking …")));
+      if (wanted === "plan") byId("plan").hidden = true; else show(byId("said"), el("p", { class: "dim" }, tr("Requesting …")));
       let planned = false;
       try {
         if (wanted === "plan") {
@@ -515,9 +515,9 @@
   /** When a stop was asked for, when the drive reacted, and when it stood still. */
   function stopSteps(stop, asking = false) {
     const steps = [];
-    if (asking && !stop.asked) steps.push(el("li", {}, tr("asking …")));
-    if (stop.asked) steps.push(el("li", {}, tr("asked {time}", { time: clock(stop.asked) })));
-    if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive reacted {time}", { time: clock(stop.seen) })));
+    if (asking && !stop.asked) steps.push(el("li", {}, tr("requesting …")));
+    if (stop.asked) steps.push(el("li", {}, tr("requested {time}", { time: clock(stop.asked) })));
+    if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive responded {time}", { time: clock(stop.seen) })));
     if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}${tr("standstill {time}", { time: clock(stop.at_rest) })}`));
     if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired stop")));
     return steps;
@@ -717,7 +717,7 @@
       if (stop.asked || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
-      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("THE DRIVE DOES NOT REACT: use the hard-wired stop") : "";
+      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("THE DRIVE DOES NOT RESPOND: use the hard-wired stop") : "";
       byId("undelivered").hidden = !text;
       if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
     }
@@ -788,7 +788,7 @@
       const text = watch.lost ? unwatched(watch)
         : unheard ? tr("The run receives nothing from this page: it stops 5 s after the last message.")
         : mine ? tr("You watch this run. If this page is hidden or closed for 5 s, the shaft stops.")
-        : watch.gone ? tr("{name} watches this run on another page, which is {how} since {time}: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by, how: word(watch.how, "page"), time: clock(watch.gone) })
+        : watch.gone ? tr("{name} watches this run on another page, which has been {how} since {time}: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by, how: word(watch.how, "page"), time: clock(watch.gone) })
         : tr("{name} watches this run on another page: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by });
       if (where.textContent !== text) where.textContent = text;
     }
@@ -836,7 +836,7 @@
       byId("left").textContent = left === null ? "" : `· ${tr("about {time} left", { time: span(left) })}`;
       if (status && status.confirmation && !byId("confirm").hidden) {
         const leftMs = new Date(status.confirmation.expires) - now;
-        byId("confirm-left").textContent = leftMs > 0 ? tr("{count} s left", { count: Math.ceil(leftMs / 1000) }) : tr("the code is void");
+        byId("confirm-left").textContent = leftMs > 0 ? tr("{count} s left", { count: Math.ceil(leftMs / 1000) }) : tr("the code is no longer valid");
       }
       if (dirty) {
         dirty = false;

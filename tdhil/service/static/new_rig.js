@@ -69,7 +69,7 @@
       const one = chosen();
       show(byId("address"), ...one.address.map((key) => input(`address.${key.name}`, place(key))));
       show(byId("parameters"), ...one.parameters.map((key) => input(key.name, tr("{quantity}, as read at the drive", { quantity: word(key.description) }), key.required && tr("required: {value}", { value: key.required }))));
-      byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it was reported yet.") : "";
+      byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it has been reported yet.") : "";
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
         one.by_hand.length ? el("p", {}, tr("Make these settings at the drive, and tick each one. A run is refused until it reads them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
@@ -191,7 +191,7 @@
           el("p", {}, Object.entries(one.fields).map(([name, text]) => `${word(name.replaceAll("_", " "), "key")} ${text}`).join(", ")),
           el("p", { class: "dim" }, tr("profile {profile} ({why})", { profile: one.profile || tr("none"), why: one.why })),
           el("button", { type: "button", class: "quiet", onclick: (event) => {
-            if (!event.target.nextElementSibling) event.target.after(" ", el("span", { class: "dim", role: "status" }, tr("The fields above have its address.")));
+            if (!event.target.nextElementSibling) event.target.after(" ", el("span", { class: "dim", role: "status" }, tr("The fields above now have its address.")));
             if (one.profile && byName.has(one.profile) && one.profile !== field("profile").value) {
               const typed = draft().address;
               field("profile").value = one.profile;

@@ -174,7 +174,7 @@
         if (busy) return;
         busy = true;
         link.closest("li").append(note);
-        const over = waiting(note, samples ? tr("The file is made") : inPage ? tr("The page is made again") : again ? tr("The PDF is made again") : tr("The PDF is made"), samples ? "samples" : inPage ? "page" : "pdf");
+        const over = waiting(note, samples ? tr("Making the file") : inPage ? tr("Making the page again") : again ? tr("Making the PDF again") : tr("Making the PDF"), samples ? "samples" : inPage ? "page" : "pdf");
         try {
           const answer = await fetch(link.href);
           if (!answer.ok) throw new Refused(errorText((await answer.json()).error));
@@ -251,7 +251,7 @@
     });
     try {
       found = await call("GET", `/runs/${id}/acceptance`, undefined, {}, 120000);
-      if (found.problem) fail(`${tr("The signature does not hold:")} ${found.problem}.`);
+      if (found.problem) fail(`${tr("The signature is not valid:")} ${found.problem}.`);
       if (!form) return;
       byId("log-sha256").textContent = found.log_sha256;
       form.querySelector("button").disabled = false;
@@ -267,7 +267,7 @@
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       submits(form, byId("evidence-said"), async () => {
-        const over = waiting(wait, tr("The archive is made"), "evidence");
+        const over = waiting(wait, tr("Making the archive"), "evidence");
         try {
           await call("POST", `/runs/${id}/evidence`, asked(form), {}, 600000);
           over(true);
@@ -539,7 +539,7 @@
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { title: `${word(quantity.name)}, ${quantity.unit}`, time: true, nameOf: (point) => when(point.date), unit: quantity.unit, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
-    }, tr("The results are compared"), "history");
+    }, tr("Comparing the results"), "history");
   }
 
   // -- comparison
@@ -577,7 +577,7 @@
         el("h2", {}, tr("Settings")), el("p", { class: "dim" }, tr("≠ marks different settings.")),
         region(tr("Settings"), el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
           el("tbody", {}, ...comparison.settings.map((one) => line(el("span", {}, one.differs ? "≠ " : "", english(one.name)), one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: tr("yes"), False: tr("no") }[value] ?? english(value))), one.differs))))));
-    }, tr("Each run is identified again"), "compare");
+    }, tr("Identifying each run again"), "compare");
   }
   const percentOf = (share) => `${share > 0 ? "+" : ""}${precise(100 * share, 2)} %`;
   const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
@@ -675,7 +675,7 @@
       show(byId("said"));
       submits(form, said, async () => {
         if (markWrong(form, wrong)) return;
-        const over = waiting(byId("said"), tr("Both logs are identified"), "calibrate"), opens = closes(form.querySelectorAll("button"));
+        const over = waiting(byId("said"), tr("Identifying both logs"), "calibrate"), opens = closes(form.querySelectorAll("button"));
         try {
           const body = { without: choices[0].value, with_body: choices[1].value, added_kg_m2: added, added_sd_kg_m2: sd, at: form.elements.at.value };
           const { calibration } = await call("POST", `/rigs/${encodeURIComponent(rig)}/calibration`, body, {}, 300000);

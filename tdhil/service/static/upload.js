@@ -118,7 +118,7 @@
       if (preview.table) show(byId("table"), table(preview.table, chosen()));
       const reading = preview.reading, place = el("div");
       show(byId("reading"), preview.run ? ofLog(preview.run) : null, reading ? figures(reading) : null, reading ? place : null, reading && reading.samples ? el("p", { class: "dim said" }, byId("reading").dataset.said) : null,
-        reading && reading.warnings.length ? el("details", { open: reading.warnings.length < 6 }, el("summary", {}, tr("Remarks of the reader: {count}", { count: reading.warnings.length })), el("ul", {}, ...reading.warnings.map((one) => el("li", {}, english(one))))) : null);
+        reading && reading.warnings.length ? el("details", { open: reading.warnings.length < 6 }, el("summary", {}, tr("Notes from reading the file: {count}", { count: reading.warnings.length })), el("ul", {}, ...reading.warnings.map((one) => el("li", {}, english(one))))) : null);
       redraw = reading && reading.samples ? plots(place, reading.plot) : () => {};
     }
 

@@ -70,7 +70,7 @@ def test_samples_that_are_made_first_show_their_progress(page, served, monkeypat
     monkeypatch.setattr(served.service.supervisor, "work", slow)
     page.goto(f"/runs/{run}")
     page.get_by_role("link", name="samples.csv").click()
-    page.get_by_text(re.compile(r"^The file is made: \d+ s$")).wait_for()
+    page.get_by_text(re.compile(r"^Making the file: \d+ s$")).wait_for()
     with page.expect_download() as got:
         goes_on.set()
     assert Path(got.value.path()).read_text() == "time_s\n"
@@ -120,7 +120,7 @@ def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatc
     page.get_by_text("made again when it is opened").wait_for()
     page.get_by_text("made again at the next download").wait_for()
     page.get_by_role("link", name="report.html").click()
-    page.get_by_text(re.compile(r"^The page is made again: \d+ s$")).wait_for()
+    page.get_by_text(re.compile(r"^Making the page again: \d+ s$")).wait_for()
     assert page.locator(".making").get_by_role("progressbar").count() == 1
     goes_on.set()
     with page.context.expect_page() as opened:
@@ -224,7 +224,7 @@ def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_sig
     log = path.with_name("run.mcap")
     log.write_bytes(log.read_bytes() + b"x")
     page.reload()
-    page.get_by_text("The signature does not hold: the log is another one").wait_for()
+    page.get_by_text("The signature is not valid: the log is not the signed one").wait_for()
     assert page.evaluate("window.pwned") is None
 
 
@@ -325,7 +325,7 @@ def test_a_run_is_tagged_archived_and_deleted_from_its_page(page, served):
     assert page.locator("#runs tr").count() == 1 and page.locator("b#x").count() == 0
     page.goto(f"/runs/{run}")
     page.get_by_role("button", name="Archive", exact=True).click()
-    page.get_by_role("button", name="Take out of the archive").wait_for()
+    page.get_by_role("button", name="Restore from the archive").wait_for()
     page.goto("/runs")
     page.locator("#runs tr").first.wait_for()
     assert page.locator("#runs tr").count() == 1

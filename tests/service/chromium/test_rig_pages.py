@@ -142,7 +142,7 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     page.get_by_role("button", name="Scan for the drive").click()
     page.locator("#scan-said").get_by_text("node 3").wait_for()
     page.get_by_role("button", name="Use this drive").click()
-    page.get_by_text("The fields above have its address.").wait_for()
+    page.get_by_text("The fields above now have its address.").wait_for()
     assert box("Node:").input_value() == "3"
     for label, text in (("Lowest speed", "5 rpm"), ("Highest speed", "95 rpm"), ("Highest torque, either", "400"),
                         ("Longest run", "15 min"), ("Deceleration of a stop", "2"),
@@ -246,7 +246,7 @@ def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
 
     monkeypatch.setattr(served.service.supervisor, "work", slow)
     calibrate.click()
-    page.get_by_text(re.compile(r"^Both logs are identified: \d+ s$")).wait_for()
+    page.get_by_text(re.compile(r"^Identifying both logs: \d+ s$")).wait_for()
     assert page.locator("#said").get_by_role("progressbar").count() == 1
     goes_on.set()
     page.get_by_text("κ = 0.9550 (0.9454 to 0.9646)").wait_for()

@@ -29,7 +29,7 @@ def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
     page.get_by_role("button", name="Stop", exact=True).click()
     page.wait_for_url(f"**/runs/{run}")                # the page becomes the result
     page.get_by_text("stopped, at standstill").wait_for()
-    page.get_by_role("list", name="Stop").get_by_text("drive reacted").wait_for()
+    page.get_by_role("list", name="Stop").get_by_text("drive responded").wait_for()
     assert page.locator("#result .alarm").count() == 0
 
 
@@ -95,7 +95,7 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     button = page.get_by_role("button", name="Stop", exact=True)
     button.focus()
     page.keyboard.press("Enter")
-    page.get_by_text("drive reacted").wait_for()
+    page.get_by_text("drive responded").wait_for()
     served.service.wait(run, "stopped")
     page.get_by_text("stopped, at standstill").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
@@ -144,7 +144,7 @@ def test_a_stop_that_nobody_hears_says_so(page, served, way):
     page.get_by_role("button", name="Stop", exact=True).click()
     page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
     if way == "offline":
-        page.get_by_text("asking …").wait_for(state="hidden")
+        page.get_by_text("requesting …").wait_for(state="hidden")
     assert served.service.store.status(run).stop.asked is None
 
 
@@ -168,7 +168,7 @@ def test_six_tabs_and_a_stop_still_gets_through(page, served):
         one.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     served.service.wait(run, "stopped")
-    page.get_by_text("drive reacted").wait_for()
+    page.get_by_text("drive responded").wait_for()
 
 
 def watched_run(page: Any, served: Served) -> str:
@@ -251,8 +251,8 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     page.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     page.reload()
-    page.locator("li", has_text="asked ").wait_for()
-    page.get_by_text("drive reacted").wait_for()
+    page.locator("li", has_text="requested ").wait_for()
+    page.get_by_text("drive responded").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
