@@ -145,7 +145,7 @@ def parse(text: str) -> Scripted:
     found = _FAULT.fullmatch(text.strip())
     if found is None:
         raise FaultRefused(f"{text!r} is no fault", where="--fault",
-                           next_step="Write NAME[@WHEN][=VALUE][/DURATION], such as heartbeat-lost@hold+2s; "
+                           next_step="Write NAME[@WHEN][=VALUE][/DURATION], such as heartbeat-lost@hold+2s. "
                                      "--fault list shows the names")
     duration = found["duration"]
     return Scripted(found["name"], _moment(found["when"], text), found["value"] or "",

@@ -379,8 +379,7 @@ def require_faults(texts: Sequence[str], drive: str) -> None:
         if texts:
             bus_named(drive).parse_faults(texts)
     except TdhilError as error:
-        step = error.next_step.replace("; --fault list shows", ". --fault list shows").replace(
-            "--fault list shows", "The page Rehearse lists")
+        step = error.next_step.replace("--fault list shows", "The page Rehearse lists")
         raise ValuesWrong([("fault", f"{error.what}. {step}")]) from None
 
 

@@ -43,7 +43,6 @@ OF_THE_TERMINAL = {
     "tdhil/runner/stages/virtual_string.py": "tdhil evaluate",
     "tdhil/runner/virtual_string_program.py": "tdhil evaluate",
     "tdhil/service/new_rig.py": "arguments of a process",
-    "tdhil/service/start_request.py": "the text in which it replaces the option",
     "tdhil/service/supervisor.py": "arguments of a process",
     "tdhil/service/worker.py": "arguments of a process",
     "tdhil/session/evaluation.py": "tdhil evaluate",
