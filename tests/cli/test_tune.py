@@ -73,7 +73,7 @@ def test_gains_stand_at_main_shaft_and_motor_and_in_the_drives_parameters(tuned)
     assert first["value"] == pytest.approx(soft["at_motor"]["gain_nm_s_rad"])
     assert second["unit"] == "ms"
     assert any("--inner-lags" in warning for warning in document["warnings"])
-    assert any("compensated sends back" in warning for warning in document["warnings"])
+    assert any("compensated reflects up" in warning for warning in document["warnings"])
 
 
 @pytest.mark.heavy
