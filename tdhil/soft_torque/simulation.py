@@ -181,8 +181,6 @@ class SimulationTrace:
     bit_rad_s: Array
     top_torque_nm: Array
     """Torque of the drive on the rotor."""
-    first_stuck_s: Array
-    """Time of the bit's first standstill after it had turned, (loops, speeds). Infinite: never."""
     last_stuck_s: Array
     """Time of the bit's last standstill, (loops, speeds). −1: never."""
     end_s: Array
@@ -269,10 +267,7 @@ def simulate(
     count, held_ticks = ceil(duration_s / grid.tick_s), round(hold_s / grid.tick_s)
     every = max(1, round(keep_every_s / grid.tick_s))
     kept: list[tuple[float, Array, Array, Array, Array]] = []
-    first: Array = np.full(now.size, np.inf)
     last: Array = np.full(now.size, -1.0)
-    waits = pipe.bit_rad_s > 0.0      # True: has turned, and has not stood still since then
-    stood = np.zeros(now.size, dtype=bool)
     arrived = False
     for tick in range(count):
         if tick >= held_ticks and not arrived:
@@ -281,20 +276,13 @@ def simulate(
         other_nm = 0.0 if top_torque is None else top_torque.at(tick * grid.tick_s)
         top_wave, mean_top = top.step(pipe.at_top(), set_speed, other_nm)
         pipe.tick(top_wave, None if noise is None else noise.at(tick))
-        bit_speed = pipe.bit_rad_s
-        still = bit_speed == 0.0
-        np.putmask(last, still, tick + 1.0)
-        stands = still & waits
-        if stands.any():
-            first[stands] = tick + 1.0
-            stood |= stands
-        waits = ~(still | stood)
+        np.putmask(last, pipe.bit_rad_s == 0.0, tick + 1.0)
         if tick % every == 0:
-            kept.append(((tick + 1) * grid.tick_s, set_speed, mean_top, bit_speed.reshape(shape), top.torque_nm))
+            kept.append(((tick + 1) * grid.tick_s, set_speed, mean_top, pipe.bit_rad_s.reshape(shape), top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
     late = last.reshape(shape)
     return SimulationTrace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
-                           first.reshape(shape) * tick_s, np.where(late < 0.0, late, late * tick_s), count * tick_s)
+                           np.where(late < 0.0, late, late * tick_s), count * tick_s)
 
 
 class _BitNoise:
@@ -303,25 +291,36 @@ class _BitNoise:
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], seeds: Sequence[int], repeats: int
                  ) -> None:
         bits = [one.bit for one in strings]
-        self._rms = np.array([0.0 if bit is None else bit.noise_nm for bit in bits])
-        keep = np.array([np.exp(-grid.tick_s / max(1e-9, 1.0 if bit is None else bit.noise_correlation_s))
-                         for bit, grid in zip(bits, grids, strict=True)])
-        self._keep, self._new = keep, np.sqrt(1.0 - keep**2)
-        own = list(dict.fromkeys(seeds))
-        self._of = np.array([own.index(seed) for seed in seeds])
-        self._random = [np.random.default_rng(seed) for seed in own]
-        self._repeats = repeats
-        self._state = np.array([random.standard_normal() for random in self._random])[self._of]
-        self._block: Array = np.empty((0, len(own)))
+        rms = [0.0 if bit is None else bit.noise_nm for bit in bits]
+        keep = [float(np.exp(-grid.tick_s / max(1e-9, 1.0 if bit is None else bit.noise_correlation_s)))
+                for bit, grid in zip(bits, grids, strict=True)]
+        # loops with the same seed, rms and correlation have the same noise: it is drawn once
+        loops = list(zip(seeds, rms, keep, strict=True))
+        own = list(dict.fromkeys(loops))
+        first_seeds = list(dict.fromkeys(seeds))
+        self._random = [np.random.default_rng(seed) for seed in first_seeds]
+        self._seed_at = np.array([first_seeds.index(seed) for seed, _, _ in own])
+        self._rms = np.array([one[1] for one in own])
+        self._keep = np.array([one[2] for one in own])
+        self._new = np.sqrt(1.0 - self._keep**2)
+        self._own_at = np.repeat([own.index(loop) for loop in loops], repeats)
+        self._state = np.array([random.standard_normal() for random in self._random])[self._seed_at]
+        self._torque_nm: Array = np.empty((0, len(own)))
 
     def at(self, tick: int) -> Array:
         """Return the noise torque during a tick, N·m. Call it for every tick in order."""
         row = tick % NOISE_BLOCK
         if row == 0:
-            self._block = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
-        self._state = self._keep * self._state + self._new * self._block[row, self._of]
-        found: Array = np.repeat(self._rms * self._state, self._repeats)
-        return found
+            self._draw_block()
+        return self._torque_nm[row].take(self._own_at)
+
+    def _draw_block(self) -> None:
+        drawn = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
+        block = self._new * drawn[:, self._seed_at]
+        for new in block:
+            new += self._keep * self._state
+            self._state = new
+        self._torque_nm = self._rms * block
 
 
 def _columns(values: Sequence[Sequence[float]], repeats: int) -> Array:
@@ -463,8 +462,8 @@ class _Top:
         step[:, 3] /= ticks[:, None]         # the state ∫ω dt becomes the mean speed over the tick
         step[:, :, 3] = 0.0                  # the integral starts again from zero in each tick
         self._step = np.ascontiguousarray(step)
-        self._dry = np.array([drive.coulomb_nm + 0.5 * grid.coulomb_nm[0]
-                              for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
+        self._minus_dry = np.array([-(drive.coulomb_nm + 0.5 * grid.coulomb_nm[0])
+                                    for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
         self._own_dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
         self._viscous = np.array([drive.viscous_nm_s_rad for drive, _ in loops])[:, None]
         self._state = np.zeros((len(loops), size + 3, speeds))
@@ -492,8 +491,10 @@ class _Top:
         state, size = self._state, self._size
         wave = arriving.reshape(set_speed.shape)
         state[:, size] = wave
-        dry = -self._dry * np.minimum(np.maximum(state[:, 0] / SLIDING_BLUR_RAD_S, -1.0), 1.0)
-        state[:, size + 1] = dry + other_nm
+        side = state[:, 0] / SLIDING_BLUR_RAD_S
+        np.minimum(np.maximum(side, -1.0, out=side), 1.0, out=side)
+        side *= self._minus_dry
+        state[:, size + 1] = side + other_nm
         state[:, size + 2] = set_speed
         after = self._step @ state
         state[:, :size] = after
@@ -570,7 +571,10 @@ class _Bit:
     def _bent(self, speed: Array) -> Array:
         if not self._bends:
             return np.zeros_like(speed)
-        over: Array = self._falls * np.exp(speed * speed * self._curve)
+        over: Array = speed * speed
+        over *= self._curve
+        np.exp(over, out=over)
+        over *= self._falls
         return over
 
 
@@ -599,12 +603,20 @@ class _HeavyBit(_Bit):
         for part in range(self._parts):
             toward = np.where(speed != 0.0, speed, driven)      # has the sign of the motion
             bent = self._bent(speed)
-            net = driven - np.copysign(self._coulomb + bent, toward) - self._viscous * speed
+            friction = self._coulomb + bent
+            end = driven - np.copysign(friction, toward, out=friction)
+            end -= self._viscous * speed
             growth = self._slower
             if self._bends:
-                growth = growth + bent * np.abs(speed) * self._steeper
-                growth += LEAST_GROWTH
-            end = speed + net * self._pace * np.expm1(growth) / growth
+                bent *= np.abs(speed)
+                bent *= self._steeper
+                bent += self._slower
+                bent += LEAST_GROWTH
+                growth = bent
+            end *= self._pace
+            end *= np.expm1(growth)
+            end /= growth
+            end += speed
             # A reversal means that friction drives the bit back. So the bit stops, or does not break away.
             stops = end * toward < 0.0
             if self._rests_harder:
@@ -729,8 +741,8 @@ def _doubled(controller: SpeedController, search: Search) -> int:
 def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
     """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; None: not found.
 
-    The search uses a coarse grid first. Then it refines, down to the resolution, between the highest speed that sticks
-    and the next one above.
+    The search uses a coarse grid first. Then it divides the step between the highest speed that sticks and the next one
+    above, down to the resolution.
     """
     span = search.highest_rpm - search.lowest_rpm
     coarse = np.linspace(search.lowest_rpm, search.highest_rpm, max(1, ceil(span / search.coarse_rpm - 1e-9)) + 1)
@@ -742,28 +754,22 @@ def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: 
     return [None if one == np.inf else float(max(one, 0.5 * search.resolution_rpm)) for one in found]
 
 
-FINER = 4
-"""Number of parts into which a bracket is divided in each step, until the resolution is reached."""
-
-
 def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: float) -> Array:
     """Return for each row the lowest value from which on all turn; infinite: none. Resolution: step / ``parts``.
 
     ``coarse``: evenly spaced values; each row is a loop. A row in which the last value does not turn is refined like
-    the others, and its result is not used.
+    the others, and its result is not used. All values of a bracket are simulated together: the time that a simulation
+    takes depends on its ticks much more than on the number of its speeds.
     """
     first = np.array([_first_of_the_rest(row) for row in turn(coarse)])
-    rows = np.arange(len(coarse))
-    top = coarse[rows, np.minimum(first, coarse.shape[1] - 1)]
-    step, left = float(coarse[0, 1] - coarse[0, 0]), ceil(parts - 1e-9)
-    while left > 1:
-        count = FINER if left > FINER + 1 else left
-        between = top[:, None] + step * (np.arange(1, count) / count - 1.0)
-        turns = np.column_stack([turn(between), np.ones(len(top), dtype=bool)])      # the bracket's upper end turns
-        at = np.array([_first_of_the_rest(row) for row in turns])
-        top = np.column_stack([between, top])[rows, at]
-        step, left = step / count, -(-left // count)
-    return np.where(first < coarse.shape[1], top, np.inf)
+    rows, count = np.arange(len(coarse)), ceil(parts - 1e-9)
+    found = coarse[rows, np.minimum(first, coarse.shape[1] - 1)]
+    if count > 1:
+        step = float(coarse[0, 1] - coarse[0, 0])
+        between = found[:, None] + step * (np.arange(1, count) / count - 1.0)
+        at = [_first_of_the_rest(row) for row in turn(between)]
+        found = np.column_stack([between, found])[rows, at]      # the bracket's upper end turns
+    return np.where(first < coarse.shape[1], found, np.inf)
 
 
 def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
