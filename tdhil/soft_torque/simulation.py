@@ -312,14 +312,15 @@ class _BitNoise:
         row = tick % NOISE_BLOCK
         if row == 0:
             self._draw_block()
-        return self._torque_nm[row].take(self._own_at)
+        found: Array = self._torque_nm[row].take(self._own_at)
+        return found
 
     def _draw_block(self) -> None:
         drawn = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
         block = self._new * drawn[:, self._seed_at]
-        for new in block:
-            new += self._keep * self._state
-            self._state = new
+        for tick in range(NOISE_BLOCK):
+            block[tick] += self._keep * self._state
+            self._state = block[tick]
         self._torque_nm = self._rms * block
 
 
