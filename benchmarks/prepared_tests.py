@@ -44,7 +44,7 @@ class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return importlib.util.spec_from_loader(fullname, self) if fullname == self.name else None
 
     def exec_module(self, module) -> None:
-        vars(module).update(self.extra)
+        vars(module).update(self.extra, __file__=str(self.path))
         exec(self.code, vars(module))
 
 

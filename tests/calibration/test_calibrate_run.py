@@ -110,10 +110,12 @@ def test_without_a_terminal_nothing_moves(tmp_path, monkeypatch, calibrated):
 
 def test_the_question_names_what_to_do_later(monkeypatch):
     monkeypatch.setattr(sys, "stdin", Terminal("no\n"))
-    said = io.StringIO()
+    said, before_question = io.StringIO(), []
+    monkeypatch.setattr("tdhil.session.confirm._forget_what_was_typed", lambda: before_question.append(said.getvalue()))
     with pytest.raises(PreflightRefused) as refused:
         confirm_mounted(Console(file=said), "tdhil calibrate torque a.mcap with.mcap --added 55")
     assert "lock it out" in said.getvalue() and "a.mcap with.mcap" in str(refused.value)
+    assert before_question == [""]                    # what was typed before it is no answer
 
 
 @pytest.mark.parametrize("more", [[], CALIBRATE])

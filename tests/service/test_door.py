@@ -213,18 +213,35 @@ def test_connections_that_were_served_make_room_the_oldest_idle_one_first(served
     assert "connections are open, which is the limit." in served.said[1]
 
 
-def test_what_is_answered_is_closed_after_what_is_idle_and_a_change_last(served):
-    def one(method: str, complete: bool, more_body: bool = False) -> Any:
-        protocol = SimpleNamespace(
-            cycle=SimpleNamespace(response_complete=complete, more_body=more_body), scope={"method": method})
-        found = door_module._Served(socket.socket(), "x", protocol, None)
-        found.transport = SimpleNamespace(get_protocol=lambda: protocol, abort=found.peer.close)
-        return found
+def at_the_server(method: str, complete: bool, more_body: bool = False) -> Any:
+    """A connection that the HTTP server has, of the address x."""
+    protocol = SimpleNamespace(
+        cycle=SimpleNamespace(response_complete=complete, more_body=more_body), scope={"method": method})
+    found = door_module._Served(socket.socket(), "x", protocol, None)
+    found.transport = SimpleNamespace(get_protocol=lambda: protocol, abort=found.peer.close)
+    return found
 
-    web_socket = one("GET", False)
+
+def test_what_is_gone_makes_room_before_what_is_open_and_its_address_forgets_it(served):
+    door, gone, idle = served.door, at_the_server("GET", True), at_the_server("GET", True)
+    gone.peer.close()
+    among = door._served_of["x"] = dict.fromkeys([idle, gone])
+    assert not door._close_one(dict(among))
+    assert list(among) == [idle] and not idle.gone
+    assert door._close_one(dict(among)) and idle.gone
+    assert "x" not in door._served_of
+
+
+def test_a_door_that_was_never_opened_can_be_closed():
+    with socket.socket() as listening:
+        Door(listening, ROOM, print).close()
+
+
+def test_what_is_answered_is_closed_after_what_is_idle_and_a_change_last(served):
+    web_socket = at_the_server("GET", False)
     web_socket.transport.get_protocol = lambda: None
-    change, load, idle = one("POST", False), one("GET", False), one("GET", True)
-    half, new = one("POST", False, True), one("GET", False)
+    change, load, idle = (at_the_server(*one) for one in (("POST", False), ("GET", False), ("GET", True)))
+    half, new = at_the_server("POST", False, True), at_the_server("GET", False)
     new.protocol.cycle = None
     among = dict.fromkeys([change, web_socket, load, idle, half, new])
     closed = []

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import json
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, LogError, UsageError
 from tdhil.service.run_process import _cut_short
 from tdhil.service.run_state import (
     ENDED,
     FOLLOWS,
+    UNCHANGED,
     Check,
     Confirmation,
     NotSo,
@@ -20,8 +22,11 @@ from tdhil.service.run_state import (
     Status,
     Stop,
     Told,
+    Watch,
     blocking,
+    disk_full,
     end_of,
+    iso,
     way_to,
 )
 
@@ -92,10 +97,26 @@ def test_a_full_status_comes_back_from_json():
     status = Status.begun("run", "rig", AT).to(
         State.PREFLIGHT, AT, preflight=(Check("identity", "a", "b", "ok", "1018h"),), simulated=True,
         confirmation=Confirmation("00", "this moves", AT), stop=Stop(asked=AT, by="local"),
-        error=Told.of(UsageError("no", where="--x", next_step="Do")), expected_s={"setup": 10.0},
+        error=Told.of(UsageError("no", where="--x", next_step="Do")), expected_s={"setup": 10.0}, watch=Watch("a", AT),
     )
     assert Status.of_plain(json.loads(json.dumps(status.plain()))) == status
     assert status.error.exit_code == 2
+    assert status.watch.gone is None
+
+
+def test_a_time_is_utc_to_the_millisecond():
+    assert iso(1.25) == "1970-01-01T00:00:01.250Z"
+
+
+@pytest.mark.parametrize("next_step", ["Repeat it", f"{UNCHANGED}changed. Repeat it"])
+def test_a_full_disk_is_found_behind_an_error_which_keeps_what_happened_and_where(next_step):
+    error = LogError("no log", where="run.mcap", next_step=next_step)
+    error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    found = disk_full(error)
+    assert (found.what, found.where) == ("no log", "run.mcap")
+    assert (found.next_step == next_step) is next_step.startswith(UNCHANGED)
+    assert "No space left on device" in disk_full(error.__cause__).what
+    assert disk_full(UsageError("no", where="--x", next_step="Do")) is None
 
 
 def test_a_stop_that_nobody_saw_blocks_until_it_is_signed_off():

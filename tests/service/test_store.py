@@ -125,6 +125,12 @@ def rows(index: Index) -> list[object]:
     return index.find(limit=1000)
 
 
+def test_the_key_of_a_deleted_run_finds_it_for_its_user_and_rig_alone(store):
+    write_json(store.folder / "deleted_keys.json", {"runs": [["old", "a", "k", "anna"], ["new", "a", "k", "anna"]]})
+    assert store.deleted_with_key("a", "k", "anna") == "new"
+    assert store.deleted_with_key("a", "k", "otto") is store.deleted_with_key("b", "k", "anna") is None
+
+
 def test_a_deleted_index_is_made_again_the_same(store):
     index = Index(store)
     for rig, end in (("a", State.REFUSED), ("b", State.FAILED), ("a", State.STOPPED)):

@@ -1,9 +1,12 @@
 """Real-time priority: of one thread, where it is allowed, said where it isn't, and given back."""
 
+import ctypes
+import errno
 import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -70,6 +73,19 @@ def test_where_it_is_not_allowed_the_run_goes_on_and_is_told_how(monkeypatch):
     finding = priority_finding(*real_time.allowed())
     assert finding.grade == "note"
     assert HOW in finding.do
+
+
+@linux
+def test_memory_that_the_system_does_not_lock_is_told_with_its_reason(monkeypatch):
+    def refuse(_flags: int) -> int:
+        ctypes.set_errno(errno.ENOMEM)
+        return -1
+
+    monkeypatch.setattr(real_time, "_memory_limit", lambda: "")
+    monkeypatch.setattr(real_time, "_libc", lambda: SimpleNamespace(mlockall=refuse, munlockall=lambda: 0))
+    with real_time_priority(True) as raised:
+        assert not raised.memory_locked
+        assert "memory not locked: Cannot allocate memory" in raised.said
 
 
 def test_nobody_asked_or_stepped_time():
