@@ -102,8 +102,14 @@ SUBJECTS = {
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
     **{
         f"observer/{name}": _run(f"observer/{name}", "test_observer.py", "test_standstill.py")
-        for name in ("observer", "momentum_balance", "position_way", "repeated_feedback", "revival", "runaway",
-                     "shaft_bounds", "torque_following")
+        for name in ("observer", "momentum_balance", "position_way", "shaft_bounds")
+    },
+    "observer/repeated_feedback": _run(
+        "observer/repeated_feedback", "test_observer.py", "test_standstill.py", "test_guard.py",
+    ),
+    **{
+        f"observer/{name}": _run(f"observer/{name}", "test_observer.py", "test_standstill.py", f"test_{name}.py")
+        for name in ("revival", "runaway", "torque_following")
     },
     "observer/unanswered_torque": _run("observer/unanswered_torque", "test_unanswered_torque.py", "test_observer.py"),
     "observer/left_operation": _run("observer/left_operation", "test_left_operation.py", "test_stop_doubt.py"),
@@ -128,7 +134,9 @@ SUBJECTS = {
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_speed_changes _calm _coast"
     ),
-    "braking_probe": _run("stages/braking_probe", "test_braking_probe.py", "test_brake_pulse.py"),
+    "braking_probe": _run(
+        "stages/braking_probe", "test_braking_probe.py", "test_brake_pulse.py", "test_swinging_string.py",
+    ),
     "impedance": _run("stages/impedance", "test_impedance_run.py"),
     "virtual_string": _run("stages/virtual_string", "test_virtual_string.py"),
     **{f"{bus}/scan": Subject(f"drivers/{bus}/scan.py", ("path/test_scan.py", "drivers/test_modbus_pdu.py"))
@@ -354,6 +362,8 @@ EQUIVALENT = {
     "stop.py, _coast: return None (last)": _FALLS_THROUGH,
     "stop.py, _gets_slower: return False (last)": _FALLS_THROUGH,
     "stop.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
+    "observer/left_operation.py, __init__: self._braking_nms = 0.0":
+        "it is read only once a point has shown standstill, and this point sets it",
     "observer/unanswered_torque.py, __init__: self._impulse_nms = self._from_s = self._seen_s = 0.0":
         "the first point sets them",
     "observer/unanswered_torque.py, __init__: self._strained_s = 0.0 (last)": "the first point of each rule sets it",

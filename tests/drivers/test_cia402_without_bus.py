@@ -12,7 +12,7 @@ from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommunicationLost
 from drivers.quick_stop import Ended, bare_stop
 from tests.drivers.drive_benches import Run
-from tests.drivers.memory_bench import MemoryBench, MemoryObjects
+from tests.drivers.memory_bench import WATCHDOG, MemoryBench, MemoryObjects
 
 ROOT = Path(__file__).parents[2]
 
@@ -40,6 +40,14 @@ def test_the_drive_in_memory_fills_the_contract_in_under_two_hundred_lines():
     code = {line for node in ast.walk(tree) if isinstance(node, ast.stmt | ast.expr)
             for line in (node.lineno, node.end_lineno)}
     assert len(code) < 200
+
+
+def test_bytes_of_an_object_are_changed_and_restored():
+    memory = MemoryBench().memory
+    objects, before = MemoryObjects(memory), memory.read(WATCHDOG)
+    assert objects.change_bytes(*WATCHDOG, b"\x34\x12") == b"\x34\x12" == memory.read(WATCHDOG) != before
+    assert objects.restore() == ()
+    assert memory.read(WATCHDOG) == before
 
 
 def lost(run, within_s):

@@ -10,9 +10,9 @@ from drivers.cia402.cycle_period import interpolation
 from drivers.clock import SteppedClock
 from drivers.drive import Outcome, PowerState
 from drivers.errors import CommunicationLost, DriveFault, PreflightRefused
-from drivers.ethercat import raw
+from drivers.ethercat import raw, scan
 from drivers.ethercat.quick_stop import EthercatTarget
-from drivers.ethercat.scan import found_slave
+from drivers.ethercat.scan import found_slave, stations_at
 from drivers.ethercat.segment import EthercatSegment
 from drivers.quick_stop import Ended, bare_stop
 from profiles import MessageCode
@@ -402,6 +402,21 @@ def test_a_segment_without_slaves(wired):
     assert segment.stations() == []
     with pytest.raises(CommunicationLost, match="no frame comes back"):
         raw.RawStation(segment, 0).al_status()
+
+
+def test_a_scan_of_a_segment_without_slaves_is_an_error(wired):
+    wired(answers=False)
+    with pytest.raises(CommunicationLost, match="no EtherCAT slave answers"), stations_at("eth9"):
+        pass
+
+
+@pytest.mark.parametrize(("status", "driven"), [(8, True), (2, False)])
+def test_a_scan_leaves_a_segment_that_another_master_drives(wired, bench, monkeypatch, status, driven):
+    wired(status=status)
+    monkeypatch.setattr(scan, "open_segment", lambda interface: bench.segment)
+    with stations_at("eth9") as (stations, text):
+        assert (bench.segment.stations != stations) is driven
+        assert ("another master drives this segment" in text) is driven is bool(text)
 
 
 @pytest.mark.parametrize(("error", "said"), [

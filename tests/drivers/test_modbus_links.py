@@ -345,6 +345,19 @@ def test_sending_has_the_time_of_its_reply_whatever_was_waited_before(monkeypatc
     assert waits == [LONG_S]
 
 
+def test_a_request_that_the_connection_does_not_take_in_time_gets_no_reply(monkeypatch):
+    def full(self, data):
+        raise TimeoutError("timed out")
+
+    with TcpPeer(lambda number, request: []) as peer:
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
+        monkeypatch.setattr(socket.socket, "sendall", full, raising=False)
+        with pytest.raises(NoReply) as caught:
+            link.transact(1, ASK, SHORT_S)
+        link.close()
+    assert caught.value.what == "the connection accepts no data"
+
+
 def test_no_such_device(tmp_path):
     with pytest.raises(PreflightRefused, match="the device does not exist") as caught:
         RtuLink(str(tmp_path / "ttyUSB7"), MonotonicClock())

@@ -90,6 +90,15 @@ def test_what_was_displayed_before_it_is_enabled_anew_is_forgotten():
         watch.check_sample(Command(Mode.TORQUE, 5.0, 90.0), seen)
 
 
+def test_a_mode_displayed_before_it_is_enabled_leaves_the_time_of_a_switch():
+    watch, command = watching(), Command(Mode.TORQUE, 5.0, 90.0)
+    watch.expected = None
+    watch.check_sample(command, sample(5.0)._replace(mode=Mode.TORQUE))
+    watch.expected = PowerState.ENABLED
+    for k in range(1, round(MODE_SWITCH_S / 0.02)):
+        watch.check_sample(command, sample(5.0, 90.0 + k % 2, time_s=0.02 * k)._replace(mode=Mode.SPEED))
+
+
 # -- the following error -------------------------------------------------------------------------------------------
 
 

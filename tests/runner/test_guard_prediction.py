@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from drivers.drive import Command, Mode
 from drivers.errors import LimitHit
-from tdhil.runner.excitation import RigGuess
+from tdhil.runner.excitation import MotionLimits, RigGuess
 from tdhil.runner.guard import Guard
 from tdhil.runner.settings import ControlAssumptions
 from tests.runner.fake_drive import LIMITS, SPEED_RESOLUTION, TORQUE_RESOLUTION
@@ -140,3 +140,4 @@ def test_a_slow_loop_reacts_late(period_s, reaction):
 def test_what_a_plan_must_keep_free_is_what_is_foreseen():
     assumptions = ControlAssumptions(largest_speed_lag_s=0.7, reaction_s=0.2, smallest_inertia_share=0.9)
     assert Guard.foresight_s(assumptions) == pytest.approx(1.0)
+    assert Guard.room(LIMITS, assumptions, 0.25) == MotionLimits(0.75, 9.75, 400.0, Guard.foresight_s(assumptions))

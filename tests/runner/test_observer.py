@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from drivers import Command, Mode, PowerState
 from tdhil.runner.excitation import RigGuess
-from tdhil.runner.observer import Signal
+from tdhil.runner.observer import Observer, Signal
+from tests.runner.guarded import REST, sample
 from tests.runner.reporting_rig import LIMITS, Bench, Reports, Rig
 
 COUNT_RAD = 2.0 * math.pi / 8192
@@ -556,6 +557,17 @@ def test_one_way_is_not_enough():
     assert bench.quick_stop(6.0) == ""
     assert bench.samples[-1].speed_rad_s > 9.0
     assert abs(bench.speed) < 0.01
+
+
+def test_a_speed_that_does_not_change_under_the_torque_limit_of_a_stop_is_doubted():
+    """Nothing is known of the shaft, so that any inertia would fit."""
+    observer = Observer(LIMITS, PLAIN.period_s, PLAIN.speed_count)
+    observer.begin_stop()
+    for k in range(500):
+        seen = sample(5.0 + 0.01 * (k % 2), -LIMITS.torque_nm, time_s=k * PLAIN.period_s, state=PowerState.QUICK_STOP)
+        observer.see(REST, seen)
+    assert observer.doubt is not None and observer.doubt.signals == {Signal.SPEED}
+    assert "the torque limit, brake the shaft for 8 s" in observer.doubt.what
 
 
 def test_nothing_runs_away_before_a_quick_stop_was_asked_for():

@@ -9,8 +9,8 @@ from drivers.drive import Mode, Outcome, PowerState
 from drivers.errors import LimitHit, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.runner.settings import ExcitationRequest
-from tdhil.runner.stages.setup import TORQUE_SEEN_S
-from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive, refused_check
+from tdhil.runner.stages.setup import TORQUE_SEEN_S, probe_sign
+from tests.runner.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, FakeDrive, refused_check
 from tests.runner.reporting_drive import Reporting
 from tests.runner.run_outcomes import assert_at_rest, outcomes
 
@@ -119,6 +119,16 @@ def test_an_inverted_sign_is_found_at_walking_pace(world, mode):
     assert "turned backwards" in str(result.cause)
     assert max(fastest) < 0.1 * LIMITS.speed_max_rad_s
     assert_at_rest(here, result)
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_shaft_that_leaps_backwards_in_the_probe_has_an_inverted_sign(world, mode):
+    """The guard trips first."""
+    here = world()
+    here.drive.misbehave = lambda drive, s: s._replace(speed_rad_s={10: -0.05, 11: -0.5}.get(drive.cycles, 0.0))
+    with pytest.raises(PreflightRefused, match="turned backwards"):
+        probe_sign(here.bench, LIMITS, mode, SPEED_RESOLUTION)
+    assert here.guard.observer.backwards is (mode is Mode.TORQUE)
 
 
 def test_a_locked_shaft_ends_the_probe(world):

@@ -105,6 +105,16 @@ def test_time_without_feedback_counts_where_speed_mode_is_not_followed():
     assert here.bench.now_s < 60.0
 
 
+def test_lost_frames_do_not_end_a_coast(world):
+    here = world()
+    here.turn(2.0, Mode.TORQUE)
+    here.guard.observer.backwards = True
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=drive.cycles % 5 != 0)
+    report = here.stop_sequence().run()
+    assert report.confirmed and report.trouble == ()
+    assert "quick_stop" not in here.drive.calls
+
+
 def test_without_feedback_no_torque_is_released():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=not 150 <= drive.cycles < 160)

@@ -71,12 +71,14 @@ def test_reverse_rotation_is_no_more_than_the_twist_asks_for():
 
 @pytest.mark.parametrize("mode", Mode)
 def test_from_a_turning_shaft_in_either_mode(mode):
-    here = StringWorld(speed=4.0, mode=mode, stiffness=10.0)
+    here = StringWorld(speed=4.0, mode=mode, stiffness=10.0, torque=60.0)
     report = here.stop_sequence().run()
     assert report.confirmed, report.trouble
     assert report.trapped_nm > 20.0                        # what it was wound up by on the way to rest
     assert abs(here.drive.string_nm) < 2.0 * RESIDUAL_NM
     assert "quick_stop" in here.drive.calls
+    kept = [command.torque_nm for command in here.drive.commands[:2]]
+    assert kept == [60.0 if mode is Mode.TORQUE else 0.0, 0.0]      # no longer once speed mode is displayed
 
 
 @pytest.mark.heavy

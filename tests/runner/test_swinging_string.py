@@ -11,12 +11,14 @@ import pytest
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import LimitHit, PreflightRefused
+from profiles.quantities import in_nm
 from tdhil.estimation import RoughFriction
 from tdhil.recording import LagPrior
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest
 from tdhil.runner.stage_planner import StagePlanner
+from tdhil.runner.stages import speed as stage_2
 from tdhil.runner.stages.braking_probe import (
     Before,
     BrakingAnswer,
@@ -27,8 +29,8 @@ from tdhil.runner.stages.braking_probe import (
     slow_down,
     slow_speed,
 )
-from tdhil.runner.stages.speed import SpeedResult, inertia_before_echo
-from tdhil.runner.stages.steady import Swing, calm_string, is_stick_slip, swing_of, widest
+from tdhil.runner.stages.speed import LEVEL_S, OSCILLATING_LEVEL_S, SpeedResult, inertia_before_echo
+from tdhil.runner.stages.steady import Calmed, Swing, calm_string, is_stick_slip, swing_of, widest
 from tdhil.runner.string_release import SwingDamper
 from tdhil.runner.task import Task
 from tests import rigs
@@ -215,6 +217,7 @@ def test_a_demand_that_had_followed_the_switch_is_an_answer_at_once():
 def test_the_torque_itself_is_an_answer_whatever_the_demand():
     listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
     assert BrakingAnswer.FASTER in [listener.hear(seen(3000.0, demand_nm=None)) for _ in range(3)]
+    assert listener.why == f"the reported torque went from {in_nm(200.0)} to {in_nm(3000.0)}"
 
 
 def test_there_is_no_pulse_where_the_string_hides_its_answer():
@@ -280,6 +283,17 @@ def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried
         assert mean == pytest.approx(slow_speed(limits, found.wander_rad_s), abs=0.4)      # it swings, and yields
         assert mean > slow_speed(limits) + 0.5
         assert "the string below oscillates with ±" in here.guard.disturbed
+
+
+@pytest.mark.parametrize(("torque_nm", "level_s"), [(0.0, LEVEL_S), (1200.0, OSCILLATING_LEVEL_S)])
+def test_over_a_string_that_keeps_oscillating_a_level_is_longer(world, monkeypatch, torque_nm, level_s):
+    here, swing = world(limits=LIMITS), Swing(torque_nm, 0.5, 5.3, 0.9)
+    here.turn(3.0)
+    damper = SwingDamper(LIMITS.torque_nm, LIMITS.speed_max_rad_s, 3.0, PERIOD_S)
+    monkeypatch.setattr(stage_2, "calm_string", lambda *_: Calmed([], [], swing, damper))
+    held = stage_2._settle_and_hold(here.bench, LIMITS, 3.0, 0.1, ControlAssumptions())
+    assert len(held.level) * PERIOD_S == pytest.approx(level_s)
+    assert OSCILLATING_LEVEL_S > 4.0 * swing.period_s > LEVEL_S
 
 
 def test_whichever_swing_takes_the_shaft_further_counts():
