@@ -599,7 +599,7 @@ LISTEN_S = 1.0
 def _add_scan_arguments(scan: argparse._ArgumentGroup) -> None:
     """Add the option for the listening time."""
     scan.add_argument("--listen", type=_seconds, default=LISTEN_S, metavar="S",
-                      help=f"CANopen: how long to wait for answers and heartbeats (default {LISTEN_S:g} s)")
+                      help=f"CANopen: time to wait for answers and heartbeats (default {LISTEN_S:g} s)")
 
 
 def _seconds(text: str) -> float:

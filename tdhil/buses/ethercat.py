@@ -64,9 +64,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the drive's place on the segment. -i is an option of python-can, and names the network interface here."""
     group = parser.add_argument_group("EtherCAT (with -i: the network interface, such as eth1)")
     group.add_argument("--position", type=_number(0, MOST_POSITION), metavar="N",
-                       help="position of the drive on the segment; 0 is the first slave")
+                       help="position of the drive on the segment (0: the first slave)")
     group.add_argument("--alias", type=_number(1, 0xFFFF), metavar="N",
-                       help="configured station alias of the drive, in place of --position")
+                       help="configured station alias of the drive, instead of --position")
 
 
 def _number(least: int, most: int) -> Any:

@@ -174,12 +174,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of a TCP or a serial line."""
     group = parser.add_argument_group("Modbus (defaults: the profile's)")
     group.add_argument("--host", metavar="NAME", help="Modbus TCP: name or address of the drive")
-    group.add_argument("--port", type=int, metavar="N", help="TCP port (default 502)")
+    group.add_argument("--port", type=int, metavar="N", help="Modbus TCP: port (default 502)")
     group.add_argument("--serial", metavar="DEVICE", help="Modbus RTU: serial device, such as /dev/ttyUSB0")
-    group.add_argument("--baud", type=int, metavar="N", help="bit/s of the serial line")
-    group.add_argument("--parity", choices=("N", "E", "O"), help="none, even or odd")
-    group.add_argument("--stop-bits", type=int, choices=(1, 2), help="of the serial line")
-    group.add_argument("--unit", type=int, metavar="N", help="unit (slave) number of the drive")
+    group.add_argument("--baud", type=int, metavar="N", help="Modbus RTU: bit rate of the serial line, bit/s")
+    group.add_argument("--parity", choices=("N", "E", "O"), help="Modbus RTU: parity: none, even or odd")
+    group.add_argument("--stop-bits", type=int, choices=(1, 2), help="Modbus RTU: number of stop bits")
+    group.add_argument("--unit", type=int, metavar="N", help="unit (slave) address of the drive")
 
 
 def _line(cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> ModbusLine:

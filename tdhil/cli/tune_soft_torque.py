@@ -201,10 +201,10 @@ def _check(namespace: argparse.Namespace) -> None:
         raise UsageError("--bit-noise needs the string with its bit", where="--bit-noise",
                          next_step="--string string.yaml", entry=MessageCode.STRING_MISSING)
     if namespace.map and namespace.string is None:
-        raise UsageError("--map simulates the bit of string.yaml", where="--map", next_step="--string string.yaml",
+        raise UsageError("the map needs the bit of string.yaml", where="--map", next_step="--string string.yaml",
                          entry=MessageCode.STRING_MISSING)
     if namespace.map and namespace.no_simulation:
-        raise UsageError("--map simulates the bit of string.yaml", where="--map",
+        raise UsageError("the map is simulated, and --no-simulation omits simulations", where="--map",
                          next_step="Leave --no-simulation out", entry=MessageCode.VALUE_NOT_ALLOWED)
     check_inner_lags(namespace)
 
@@ -574,27 +574,27 @@ def _tuned_for(
         if parameters is not None and parameters.note:
             warnings.append(f"{profile.name}: {parameters.note}")
         if any(one.compensated_share for one in tuning.tuned):
-            warnings.append("inertia compensation needs the derivative of the measured speed in the drive; few drives "
-                            "have it, and a feed-forward of the set speed's acceleration is not it")
+            warnings.append("Inertia compensation needs feedback of the measured acceleration in the drive. Few drives "
+                            "have it. Feed-forward of the setpoint's acceleration does not replace it.")
     if namespace.bit_noise is not None and (bit := tuning.case.string.bit) is not None:
-        warnings.append(f"the bit noise of {bit.noise_nm:.0f} N·m rms is that of the record in "
-                        f"{namespace.bit_noise.name}; it holds for its bit, formation and weight on bit")
+        warnings.append(f"The bit noise of {bit.noise_nm:.0f} N·m rms is that of the record in "
+                        f"{namespace.bit_noise.name}. It is valid for the bit, formation and weight on bit there.")
     if not namespace.inner_lags and namespace.impedance is None:
-        warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
-                        "them with --inner-lags")
+        warnings.append("The lags inside the loop are assumed. They limit the gains and how much of J can be "
+                        "compensated. State them with --inner-lags.")
     if namespace.string is None and not tuning.case.inertia_draws:
-        warnings.append("the result does not state the covariance of J, k, f and J_L: they are drawn independently of "
-                        "each other; identify the log again with tdhil replay to get it")
+        warnings.append("The result does not state the covariance of J, k, f and J_L, so tdhil draws them "
+                        "independently of each other. Run tdhil replay on the log to get the covariance.")
     if namespace.string is None and not tuning.case.string.supposed:
-        warnings.append(f"the pipe is the one that k, f and J_L as identified have in common, ζ = "
-                        f"{tuning.case.string.impedance_nm_s_rad:.4g} N·m·s/rad; name the bit in a string.yaml for "
-                        "critical speeds")
+        warnings.append(f"The string is the uniform pipe that has the identified k, f and J_L: ζ = "
+                        f"{tuning.case.string.impedance_nm_s_rad:.4g} N·m·s/rad. State the bit in a string.yaml for "
+                        "critical speeds.")
     elif namespace.string is None:
         warnings.append("|r|, a and the modes above the lowest one assume a spring with a tenth of the mass of its "
-                        "load and a damping of at least 0.01: describe the pipe in a string.yaml for better values, "
-                        "and the bit for critical speeds")
+                        "load and a damping ratio of at least 0.01. Describe the pipe in a string.yaml for better "
+                        "values, and the bit for critical speeds.")
     elif tuning.case.string.bit is None:
-        warnings.append("no bit is stated in string.yaml: critical speeds need one")
+        warnings.append("No bit is stated in string.yaml. The critical speeds need the bit.")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
                     None if profile is None else profile.name, ratio, namespace.loop, sources.lags, sources.present,
                     settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED},

@@ -286,7 +286,7 @@ def _settings(row: FleetRow, document: Mapping[str, Any], recording: Any, run: M
         "periods used": row.periods_used,
         "cycles, Hz": (document.get("cycle") or {}).get("rate_hz"),
         "gear": recording.gear_ratio,
-        "torque scale, 1 sd": row.torque_scale_rel_sd,
+        "standard uncertainty of the torque scale": row.torque_scale_rel_sd,
         "torque calibration": None if row.torque_calibration is None else row.torque_calibration[:10],
         "torque limit, N·m": recording.torque_limit_nm,
         "speed window, rad/s": f"{limits['speed_min_rad_s']:g} to {limits['speed_max_rad_s']:g}"

@@ -486,7 +486,7 @@ def _grounds(document: Part, recording: Recording, sha256: str) -> Iterator[tupl
     if (inertia := document["inertia_kg_m2"]) is not None:
         yield "the repeatability is conditional on", "; ".join(inertia["conditional_on"])
         yield "coverage of every interval", f"{100.0 * inertia['confidence']:g} %"
-    yield "torque scale, 1 sd", f"{100.0 * recording.torque_scale_rel_sd:g} %"
+    yield "standard uncertainty of the torque scale", f"{100.0 * recording.torque_scale_rel_sd:g} %"
     if document["reference_inertia_kg_m2"] is not None:
         yield "reference J (rig.yaml)", f"{document['reference_inertia_kg_m2']:g} kg·m²"
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:

@@ -62,7 +62,7 @@ def figures_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: 
 
 def print_settings(settings: Iterable[tuple[str, str, str]], console: Console) -> None:
     """Print parameters of the drive with the value to enter and its confidence."""
-    console.print(Text("to be typed into the drive, by hand", style="bold"))
+    console.print(Text("to be typed into the drive, by hand (confidence of the profile's entry)", style="bold"))
     grid = Table.grid(padding=(0, 2))
     for _ in range(2):
         grid.add_column(overflow="fold")

@@ -114,21 +114,21 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     critical, predicted = document["critical_rpm"], document["predicted_critical_rpm"]
     expected_text = f"tune: {predicted['value']:.0f} ({predicted['low']:.0f} to {predicted['high']:.0f})"
     yield "critical speed", (
-        f"not found; {expected_text}" if critical is None
-        else f"{critical['value']:.1f} rpm, above {critical['low']:.1f}; {expected_text}")
+        f"not found; {expected_text} rpm" if critical is None
+        else f"{critical['value']:.1f} rpm, above {critical['low']:.1f}; {expected_text} rpm")
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     expected_text = f"tune: {expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})"
     yield "least damping", (
-        f"not seen; {expected_text}" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz; "
-        f"{expected_text}")
+        f"not found in the decay; {expected_text}" if damping is None
+        else f"{_damping(damping)} at {damping['hertz']:.3f} Hz; {expected_text}")
     rms = document["torque_rms_nm"]
     yield "torque at the top, rms", ", ".join(
-        f"{value:.0f} N·m {what}" for what, value in rms.items() if value is not None) or "not seen"
+        f"{value:.0f} N·m {what}" for what, value in rms.items() if value is not None) or "not measured"
     if document["trials"]:
         yield "trials, rpm", ", ".join(
             f"{one['set_rpm']:.1f} {'turns' if one['turns'] else 'sticks'}" for one in document["trials"])
     loop = document["loop"]
-    yield "unknown torque", f"{loop['unknown_rms_nm']:.0f} N·m rms; {loop['put_in_j']:.0f} J by the loop's errors"
+    yield "unknown torque", f"{loop['unknown_rms_nm']:.0f} N·m rms; {loop['put_in_j']:.0f} J by the loop's own errors"
     if document["bit"]:
         yield "bit", f"{document['bit']}: the results are valid for this bit only"
     yield "log", document["log"]
@@ -147,7 +147,7 @@ _VERDICTS = {
 _CLOSE_S = 60.0
 _CLOSE = (
     (Phase.HOLD, 5.0, "At the first set speed the bit must stick and slip."),
-    (Phase.RELEASED, 35.0, "The bit turns; it is lifted off bottom, and the oscillation decays."),
+    (Phase.RELEASED, 35.0, "The bit turns and is lifted off bottom. The oscillation decays."),
 )
 """Phases shown in detail, for `_CLOSE_S`, from so many seconds before."""
 
@@ -177,13 +177,13 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
         sections.append(ReportSection("Bit and top drive", (
             *shown,
             Picture("string_course", partial(draw_course, rows=rows), 3.4,
-                    "The whole course: the ramp of the set speed, and trials at steady set speeds, each from a bit "
-                    "about to break away. Below: torque of drive and string at the main shaft."),
+                    "The whole stage: the ramp of the set speed, then trials at steady set speeds, each from a bit "
+                    "that is about to break away. Below: torque of drive and string at the main shaft."),
         )))
     if document["trials"]:
         sections.append(ReportSection("Trials", (
-            Table((Column("set speed, rpm", 0.3, number=True), Column("the bit ends", 0.7)),
-                  tuple((f"{one['set_rpm']:.1f}", "turning" if one["turns"] else "sticking")
+            Table((Column("set speed, rpm", 0.3, number=True), Column("the bit finally", 0.7)),
+                  tuple((f"{one['set_rpm']:.1f}", "turns" if one["turns"] else "sticks")
                         for one in sorted(document["trials"], key=lambda one: float(one["set_rpm"])))),
         )))
     sections += [
@@ -216,10 +216,10 @@ def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
            f"{cure['value']:.0f} ({cure['low']:.0f} to {cure['high']:.0f})")
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     yield ("least damping of the lowest modes",
-           "not seen" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz",
+           "not found in the decay" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz",
            f"{expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})")
     for what, value in document["torque_rms_nm"].items():
-        yield f"torque at the top, rms, {what}, N·m", "not seen" if value is None else f"{value:.0f}", "–"
+        yield f"torque at the top, rms, {what}, N·m", "not measured" if value is None else f"{value:.0f}", "–"
     ramp = document["ramp_rpm"]
     yield "last stick on the ramp, rpm", "none" if ramp is None else f"{ramp:.1f}", "–"
 
@@ -232,8 +232,8 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     if law["compensated_kg_m2"]:
         yield "inertia compensated", f"{law['compensated_kg_m2']:.4g} kg·m²"
     yield "real machine", (
-        f"{rig['inertia_kg_m2']:.4g} kg·m² at the motor, gear {rig['gear_ratio']:g}, the reported speed "
-        f"{rig['speed_lag_s']:.3g} s late; torques scaled by {loop['scale']:.3g}")
+        f"{rig['inertia_kg_m2']:.4g} kg·m² at the motor, gear {rig['gear_ratio']:g}; lag of the reported speed "
+        f"{rig['speed_lag_s']:.3g} s; torques scaled by {loop['scale']:.3g}")
     yield "torque limit", ("never acted" if not loop["clamped_cycles"] else
                            f"acted in {loop['clamped_cycles']} cycles: the string's torque was cut off")
     yield "torque without a command", f"{loop['unknown_rms_nm']:.0f} N·m rms"

@@ -80,8 +80,8 @@ GRAPHS = {
         "|r| is near 1 there (a stiff controller: type in the soft gains)"),
     "modes": Graph(
         "Soft torque: modes and their damping",
-        "the lowest pair is well damped",
-        "a point near or below 0 oscillates for long (change --a, or compensate less)"),
+        "the points below the second mode of the string are well damped",
+        "one of these points is near 0, or any point is below 0 (change --a, or compensate less)"),
     "stick_slip": Graph(
         "Soft torque: stick-slip, with and without",
         "the bit comes free and turns steadily after a few oscillations",

@@ -45,10 +45,10 @@ def map_section(document: Part, bit: str) -> ReportSection:
     return ReportSection("The operator's map", (
         Picture("map", partial(draw_map, document=document), 2.9, HOW_TO_READ),
         Table((Column(title, 0.2), *(Column(kind, width) for kind in kinds)), rows),
-        Text(f"Simulated every {document['speeds_rpm'][1] - document['speeds_rpm'][0]:.0f} rpm under bit noise, string "
-             f"and J as stated. The bit is that of string.yaml ({bit}), with its torque scaled. The bit torque is that "
-             "of a bit that turns fast." + ("" if weights is None else " Weight on bit: the bit torque over "
-             "torque_per_weight_nm_kn of string.yaml.")),
+        Text(f"Simulated every {document['speeds_rpm'][1] - document['speeds_rpm'][0]:.0f} rpm, with bit noise; string "
+             f"and J have their stated values. The bit is that of string.yaml ({bit}), with its torque scaled. The bit "
+             "torque is that of a bit that turns fast." + ("" if weights is None else " Weight on bit: the bit torque "
+             "over torque_per_weight_nm_kn of string.yaml.")),
     ))
 
 
@@ -60,7 +60,7 @@ def map_figures(document: Part) -> tuple[str, ...]:
 def print_map(document: Part, console: PlainConsole) -> None:
     """Print the map: for each bit torque, the set speeds in words."""
     title, rows = _rows(document)
-    console.print(Words("set speeds over bit torque; between the two speeds: at risk", style="bold"))
+    console.print(Words("map of bit torque and set speed; at risk between the two speeds", style="bold"))
     grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     for name in (title, *document["states"]):
         grid.add_column(name)

@@ -52,14 +52,13 @@ def setting_words(setting: Part) -> str:
     return str(setting["why"]) if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
 
 
-def settings_section(settings: Iterable[tuple[str, str, str]], step: str) -> ReportSection:
-    """Return the drive's parameters with values and confidence; ``step``: what to change alone, ``value`` or
-    ``thing``.
-    """
+def settings_section(settings: Iterable[tuple[str, str, str]]) -> ReportSection:
+    """Return the drive's parameters with values, and the confidence of their entries in the profile."""
     return ReportSection("To be typed into the drive, by hand", (
         Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
-        Text(f"Nothing here was written to any drive. Change one {step} at a time, at a low speed, with the "
-             "hard-wired stop within reach."),
+        Text("tdhil wrote nothing to the drive. Change one value at a time, at a low speed, with the hard-wired "
+             "emergency stop within reach. The confidence is that of the profile's entry "
+             "(docs/reference/profiles.md)."),
     ))
 
 
@@ -113,7 +112,7 @@ def _worst_between(found: DepthSchedule) -> str:
     least, at_m = min(margins)
     words = f"Interpolated halfway between rows: least phase margin {least:.0f}° (at {at_m:.0f} m)"
     thin = [one for one in found.between if one.failed]
-    words += f", thin at {', '.join(f'{one.depth_m:.0f}' for one in thin)} m" if thin else ""
+    words += f", margins too small at {', '.join(f'{one.depth_m:.0f}' for one in thin)} m" if thin else ""
     known = {one.depth_m: one.cure.median for one in (*found.rows, *found.between) if one.cure is not None}
     costs = []
     for one in found.between:
@@ -131,7 +130,7 @@ def _worst_between(found: DepthSchedule) -> str:
 
 def print_schedule(document: Part, console: PlainConsole) -> None:
     """Print the table of depths and the worst case of interpolation."""
-    console.print(Words(f"gains over depth, {document['kind']}, linear between rows", style="bold"))
+    console.print(Words(f"gains over depth, {document['kind']}: linear in depth between two rows", style="bold"))
     console.print(figures_table(schedule_headings(document), _table(document), left=0))
     thin = any(one.get("failed") for one in document["between"])
     console.print(Words(document["sentence"], style="bold red" if thin else ""))

@@ -173,7 +173,7 @@ def _noise_words(one: Part) -> str:
     rms = f"{_with(found['rms_nm'], 0, ' N·m')} rms"
     if found["correlation_measured"]:
         return f"{rms}, correlation time {time_s['value']:.2f} s"
-    return f"{rms}, if its correlation time is {time_s['value']:.2f} s as stated: the record does not determine it"
+    return f"{rms} for the stated correlation time of {time_s['value']:.2f} s: the record does not determine this time"
 
 
 def _reflection(one: Part) -> str:
@@ -203,8 +203,8 @@ def severity_report(document: Part, found: Sequence[Severity]) -> Report:
             Picture("bit_speed", partial(draw_detail, one=one), 2.6,
                     f"{lead}speed at the bit (estimated) and at the top, around the highest severity of the record."),
             Picture("severity", partial(draw_index, one=one), 2.0,
-                    f"{lead}severity index over the whole record. Above the upper line the bit sticks and slips, "
-                    "above the lower one it is at risk."),
+                    f"{lead}severity index over the whole record. Above the upper line a bit that nearly stops sticks "
+                    "and slips; above the lower one it is at risk."),
         ]
     rows = tuple((name, *cells) for name, cells in _rows(records))
     check = last["reflection"]

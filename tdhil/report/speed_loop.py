@@ -439,7 +439,7 @@ def loop_report(document: Part) -> Report:
     ]
     settings = list(_setting_rows(document))
     if settings:
-        sections.append(settings_section(settings, "value"))
+        sections.append(settings_section(settings))
     if document["notch_by_hand"] is not None:
         sections.append(ReportSection("Notch filter, to be set by hand", (Text(document["notch_by_hand"]),)))
     tuned_for = document["tuned_for"]

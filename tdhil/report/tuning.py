@@ -369,7 +369,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
 def _figures(document: Part) -> list[str]:
     """Return the names of all rows and columns of the card and the page."""
     names = [name for name, _ in (*_rests_on(document), *_rows(document))]
-    names += ["in brackets", "ψ", "draws", *(one["kind"] for one in document["controllers"])]
+    names += ["in brackets", "*", "draws", *(one["kind"] for one in document["controllers"])]
     if document.get("schedule"):
         names += schedule_headings(document["schedule"])
     if document.get("map"):
@@ -403,9 +403,9 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     yield "J compensated", [f"{100 * one['compensated_share']:.0f} %" for one in taken]
     yield "|r|, mean", [f"{one['reflection_at_lowest_mode']['value']:.2f}, {one['mean_reflection']['value']:.2f}"
                         for one in taken]
-    yield "damping ψ", [f"{one['least_damping']['low']:.2f}–{one['least_damping']['high']:.2f}" for one in taken]
+    yield "damping *", [f"{one['least_damping']['low']:.2f}–{one['least_damping']['high']:.2f}" for one in taken]
     if noise:
-        yield "no noise ψ, rpm", [_speed(one["critical_rpm"]["cure"], document) for one in taken]
+        yield "no noise *, rpm", [_speed(one["critical_rpm"]["cure"], document) for one in taken]
     wrongs: list[Part] = next((one["inertia_wrong_by"] for one in taken if one["inertia_wrong_by"]), [])
     for k, error in enumerate(wrong["error"] for wrong in wrongs):
         yield (f"J {100 * error:+.3g} % wrong",
@@ -509,20 +509,21 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         )),
         ReportSection("Modes and their damping", (
             Picture("modes", partial(draw_modes, document=document), 2.3,
-                    "Damping ratio of each mode of string and top drive together; the lowest pair decides."),
+                    "Damping ratio of each mode of string and top drive together. The table has the least one below "
+                    "the second mode of the string."),
         )),
     ]
     if showcase is not None:
         sections.append(ReportSection("Stick-slip, with and without", (
             Picture("stick_slip", partial(draw_showcase, showcase=showcase), 1.7 * len(showcase.kinds) + 0.5,
-                    f"Simulated: a stuck bit at a set speed of {showcase.set_rpm:.0f} rpm; the bit in colour, the top "
-                    "drive in grey."),
+                    f"Simulated, without bit noise: the bit starts stuck, at a set speed of {showcase.set_rpm:.0f} rpm."
+                    " The bit is in colour, the top drive in grey."),
         )))
     if document.get("map"):
         sections.append(map_section(document["map"], document["string"]["bit"]["words"]))
     settings = list(_setting_rows(document))
     if settings:
-        sections.append(settings_section(settings, "thing"))
+        sections.append(settings_section(settings))
     if document.get("schedule"):
         sections.append(schedule_section(document["schedule"]))
     rests: list[tuple[str, str]] = list(_rests_on(document))
@@ -550,14 +551,14 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
             headline, verdict = "No gains are recommended", "critical speeds not compared"
         return AnswerBox("red" if thin else "yellow", headline, lines, verdict, sentence, "")
     gains = best["at_motor"]
-    remarks = [f"at the motor shaft; {best['kind']}: {words_of(best['kind'])}"]
+    remarks = [f"At the motor shaft. {best['kind'].capitalize()}: {words_of(best['kind'])}"]
     if gains["compensated_kg_m2"]:
-        remarks.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
-                     f"{1e3 * gains['derivative_filter_s']:g} ms")
+        remarks.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², with a filter of "
+                     f"{1e3 * gains['derivative_filter_s']:g} ms on the measured acceleration")
     headline = f"P = {gain_words(gains['gain_nm_s_rad'])} N·m·s/rad, I = {gain_words(gains['integral_nm_rad'])} N·m/rad"
     required = document["required_margins"]
-    verdict = (f"keeps {required['phase_deg']:.0f}°, {required['gain_db']:g} dB and "
-               f"{1e3 * required['dead_time_s']:.0f} ms on every sampled machine and string")
+    verdict = (f"keeps a phase margin of {required['phase_deg']:.0f}°, a gain margin of {required['gain_db']:g} dB and "
+               f"a dead-time reserve of {1e3 * required['dead_time_s']:.0f} ms on every sampled machine and string")
     return AnswerBox("green", headline, tuple(remarks), verdict, sentence, "")
 
 

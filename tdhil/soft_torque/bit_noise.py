@@ -125,8 +125,9 @@ def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) 
             next_step="Record faster, with a finer resolution, or with shorter filters of the reports")
     if value.misfit > MOST_MISFIT:
         raise SeverityRefused(
-            f"the spectrum of the torque at the bit is not that of a noise: it deviates {value.misfit:.1f} times as "
-            "much as it scatters", next_step="Check length and sizes in string.yaml, J and the lags of the reports")
+            "the spectrum of the torque at the bit is not that of a noise: its deviation is "
+            f"{value.misfit:.1f} times its scatter",
+            next_step="Check length and sizes in string.yaml, J and the lags of the reports")
     moved = [[_fitted(spectra, string, end, record, held_s).rms for end in (inertia.low, inertia.high)]]
     moved += [[_fitted(spectra, end, inertia.value, record, held_s).rms for end in pair]
               for pair in (*string_ends(string), *_bit_ends(string))]
@@ -198,8 +199,8 @@ def _spectra(record: SurfaceRecord, string: DrillString, inertia: Interval) -> _
         needed_s = 0.5 * (LEAST_SEGMENTS + 1) * SEGMENT_PERIODS * period_s
         why = " without stick-slip" if sticks else ""
         raise SeverityRefused(
-            f"the record has {len(rows)} segments of steady rotation{why}; the bit's random torque takes "
-            f"{LEAST_SEGMENTS}, which is {needed_s:.0f} s without a pause", next_step="Name a longer record of steady "
+            f"the record has {len(rows)} segments of steady rotation{why}; the estimate needs "
+            f"{LEAST_SEGMENTS}, which is {needed_s:.0f} s without a pause", next_step="Use a longer record of steady "
             "rotation at a set speed above the critical one")
     speeds, torques, speed_noise, torque_noise, means = zip(*rows, strict=True)
     return _ReportSpectra(hertz[band], np.array(speeds), np.array(torques), per_density, float(np.median(speed_noise)),

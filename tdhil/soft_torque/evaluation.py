@@ -128,28 +128,28 @@ def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
     """
     rate_hz, law = 1.0 / period_s, case.law
     if case.string.bit is None:
-        raise EvaluationRefused("no bit is stated: nothing would stick", where="string.yaml, bottom",
-                                next_step="State its friction: coulomb_nm, static_nm, stribeck_speed_rad_s")
+        raise EvaluationRefused("no bit is stated, so there is no stick-slip to evaluate", where="string.yaml, bottom",
+                                next_step="State the friction of the bit: coulomb_nm, static_nm, stribeck_speed_rad_s")
     if any(line.drag_nm_s_rad_m < LEAST_DRAG_NM_S_RAD_M for line in case.string.lines):
         raise EvaluationRefused(
-            f"a virtual string needs a drag of {LEAST_DRAG_NM_S_RAD_M:g} N·m·s/rad per metre or more in every section: "
-            "what the loop's own errors put into it has to go somewhere",
-            where="string.yaml, drag_nm_s_rad_m", next_step="Leave it out for that of mud, 0.005")
+            f"a virtual string needs a drag of {LEAST_DRAG_NM_S_RAD_M:g} N·m·s/rad per metre or more in every section, "
+            "to damp the energy of the loop's own errors",
+            where="string.yaml, drag_nm_s_rad_m", next_step="Leave the key out: the default of 0.005 is that of mud")
     quickest = law.gain_nm_s_rad / (case.meant.inertia_kg_m2 - law.compensated_kg_m2) * period_s
     if rate_hz < LOWEST_RATE_HZ * (1.0 - 1e-9) or quickest > MOST_CROSSOVER:
         needed = max(LOWEST_RATE_HZ, rate_hz * quickest / MOST_CROSSOVER)
         raise EvaluationRefused(
-            f"{rate_hz:.3g} cycles a second are too few: the loop would oscillate with its cycle, not with the string",
+            f"{rate_hz:.3g} cycles a second are too few for these gains: the sampled loop itself would oscillate",
             where="--rate", next_step=f"This controller needs {needed:.3g} cycles a second or more")
     if case.own_loop and abs(case.scale * case.rig.gear_ratio - 1.0) > SAME_INERTIA:
         raise EvaluationRefused(
-            f"the drive's own loop turns {case.rig.inertia_kg_m2 * case.rig.gear_ratio**2:.4g} kg·m² at the main shaft,"
-            f" and the gains are for {case.meant.inertia_kg_m2:.4g}",
-            where="--own-loop", next_step="Tune for this rig, or leave --own-loop out, which scales")
+            f"the rig has {case.rig.inertia_kg_m2 * case.rig.gear_ratio**2:.4g} kg·m² at the main shaft, "
+            f"and the gains are for {case.meant.inertia_kg_m2:.4g}",
+            where="--own-loop", next_step="Tune for this rig, or leave --own-loop out: tdhil then scales the torque")
     if case.rig.speed_lag_s > MOST_LAG_S or case.speed_lag_error_s > MOST_LAG_ERROR_S:
         raise EvaluationRefused(
-            f"the reported speed lags by {case.rig.speed_lag_s:.3g} ± {case.speed_lag_error_s:.2g} s; up to "
-            f"{MOST_LAG_S:g} s, known to ±{MOST_LAG_ERROR_S:g} s, can be undone",
+            f"the reported speed lags by {case.rig.speed_lag_s:.3g} ± {case.speed_lag_error_s:.2g} s; the "
+            f"observer corrects at most {MOST_LAG_S:g} s, known to ±{MOST_LAG_ERROR_S:g} s",
             where="speed_lag_s of the result", next_step="Lower the drive's filter of the reported speed, or identify "
             "again with a multisine, for longer")
 
@@ -334,19 +334,19 @@ def _verdict(
     predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
     unknown_nm, foreign = unknown
     if clamped:
-        return EvaluationOutcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
+        return EvaluationOutcome.INVALID, f"the torque limit acted on the virtual string's torque in {clamped} cycles"
     if foreign > FOREIGN_SHARE:
         return EvaluationOutcome.INVALID, (
-            f"{unknown_nm:.0f} N·m rms of torque that was not commanded, {100.0 * foreign:.0f} % of what moved the "
-            "shaft: " + ("the drive's gains are not these, or " if case.own_loop else "")
+            f"{unknown_nm:.0f} N·m rms of torque that was not commanded, {100.0 * foreign:.0f} % of the "
+            "torque that moved the shaft: " + ("the drive has other gains, or " if case.own_loop else "")
             + "inertia, friction or lags are not those of the result")
     if not did_stick:
         return EvaluationOutcome.NOT_FOUND, "the bit did not stick and slip at the first set speed"
     if critical is None:
         if reached < program.highest_rad_s - 0.5 * RPM:
             return (EvaluationOutcome.NOT_FOUND,
-                    f"the run ended at {reached / RPM:.0f} rpm, before the bit had ended turning")
-        return EvaluationOutcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
+                    f"the run ended at {reached / RPM:.0f} rpm, before a bit that was stuck kept turning")
+        return EvaluationOutcome.NOT_FOUND, "a stuck bit did not keep turning at any set speed, up to the highest one"
     words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
     if disturbed is not None:
         words += (f"; under the {unknown_nm:.0f} N·m rms of torque that was not commanded, the bit turns in "

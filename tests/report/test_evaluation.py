@@ -31,7 +31,7 @@ def test_the_page_has_both_columns_and_the_pictures(tmp_path):
     assert critical[1:] == ("57.2, above 56.3", "57 (56 to 59)")
     assert damping[1].startswith("0.220") and damping[2] == "0.226 (0.213 to 0.240)"
     assert "sticking" in sticking[0]
-    assert page.sections[2].blocks[0].rows == (("56.3", "sticking"), ("57.2", "turning"), ("60.0", "turning"))
+    assert page.sections[2].blocks[0].rows == (("56.3", "sticks"), ("57.2", "turns"), ("60.0", "turns"))
     text = write_evaluation_report(document(log), log, tmp_path / "x.html").read_text(encoding="utf-8")
     assert text.count("<svg") == 3
     assert "SIMULATED" in text and "A. &lt;Person&gt;" in text and "\x1b" not in text

@@ -20,7 +20,7 @@ from tdhil.report import (
     severity_report,
     tuning_document,
 )
-from tdhil.report.blocks import Pairs, Table
+from tdhil.report.blocks import Pairs, Picture, Table
 from tdhil.report.figure_words import FIGURES, HEADING, meaning
 from tdhil.report.operator_map import print_map
 from tdhil.report.tuning import TunedFor, print_tuning, tuning_report
@@ -126,6 +126,11 @@ def test_figures_of_a_tuning(tuned):
     page = tuning_report(tuned, None)
     check(page, text, names_of(page)[0])
     assert "bit noise" in text and "200 N·m rms" in text and "reserve" in text
+    assert "ψ" not in text          # a symbol of damping in other texts, not the mark of a footnote
+    words = " ".join(text.split())
+    assert "static at rest, Coulomb when fast" in words and "least damping ratio below the second mode" in words
+    assert any("least one below the second mode" in block.caption for section in page.sections
+               for block in section.blocks if isinstance(block, Picture) and block.graph == "modes")
 
 
 @pytest.mark.heavy

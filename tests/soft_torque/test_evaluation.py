@@ -159,8 +159,8 @@ def test_critical_speed_and_damping_are_read_off_the_rows():
      "critical speed 66.1 rpm, predicted 56 to 59"),
     (rows(49.0, (49.5, 48.6), damping=0.22), EvaluationOutcome.DIFFERS, "critical"),
     (rows(40.0, ()), EvaluationOutcome.NOT_FOUND, "did not stick"),
-    (rows(99.0, (60.0, 70.0)), EvaluationOutcome.NOT_FOUND, "ended at 70 rpm, before the bit had ended turning"),
-    (rows(99.0, (60.0, 79.0)), EvaluationOutcome.NOT_FOUND, "never ended turning"),
+    (rows(99.0, (60.0, 70.0)), EvaluationOutcome.NOT_FOUND, "ended at 70 rpm, before a bit that was stuck"),
+    (rows(99.0, (60.0, 79.0)), EvaluationOutcome.NOT_FOUND, "did not keep turning at any set speed"),
     (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), EvaluationOutcome.INVALID, "torque limit"),
     (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), EvaluationOutcome.INVALID, "was not commanded"),
 ], ids=["higher", "lower", "never stuck", "cut short", "never turned", "clamped", "another rig"])
