@@ -115,7 +115,7 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     expected_text = f"tune: {predicted['value']:.0f} ({predicted['low']:.0f} to {predicted['high']:.0f})"
     yield "critical speed", (
         f"not found; {expected_text} rpm" if critical is None
-        else f"{critical['value']:.1f} rpm, above {critical['low']:.1f}; {expected_text} rpm")
+        else f"{critical['value']:.1f} rpm, sticks at {critical['low']:.1f}; {expected_text} rpm")
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     expected_text = f"tune: {expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})"
     yield "least damping", (
@@ -212,7 +212,7 @@ def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
     """Yield (quantity, measured, predicted)."""
     critical, cure = document["critical_rpm"], document["predicted_critical_rpm"]
     yield ("critical speed, rpm",
-           "not found" if critical is None else f"{critical['value']:.1f}, above {critical['low']:.1f}",
+           "not found" if critical is None else f"{critical['value']:.1f}, sticks at {critical['low']:.1f}",
            f"{cure['value']:.0f} ({cure['low']:.0f} to {cure['high']:.0f})")
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     yield ("least damping of the lowest modes",

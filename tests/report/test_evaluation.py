@@ -28,7 +28,7 @@ def test_the_page_has_both_columns_and_the_pictures(tmp_path):
     assert headings == ["Measured and predicted by tune", "Bit and top drive", "Trials", "Basis of the result", "Run",
                         "Meaning of the figures"]
     critical, damping, sticking, *_ = page.sections[0].blocks[0].rows
-    assert critical[1:] == ("57.2, above 56.3", "57 (56 to 59)")
+    assert critical[1:] == ("57.2, sticks at 56.3", "57 (56 to 59)")
     assert damping[1].startswith("0.220") and damping[2] == "0.226 (0.213 to 0.240)"
     assert "sticking" in sticking[0]
     assert page.sections[2].blocks[0].rows == (("56.3", "sticks"), ("57.2", "turns"), ("60.0", "turns"))

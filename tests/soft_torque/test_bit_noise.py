@@ -97,7 +97,7 @@ def test_string_and_inertia_widen_the_interval():
 def test_what_does_not_hold_it_is_refused_in_words():
     case = drilled(200.0, 0.2, 2)
     whole = record(case, 0)
-    with pytest.raises(SeverityRefused, match=r"has 3 segments of steady rotation; .* takes 8, which is 208 s"):
+    with pytest.raises(SeverityRefused, match=r"has 3 segments of steady rotation; .* needs 8, which is 208 s"):
         bit_noise_in(part(whole, 110.0), STRING, INERTIA)
     with pytest.raises(SeverityRefused, match="noise of the reports is"):
         bit_noise_in(record(case, 0, noise=(0.2, 2000.0)), STRING, INERTIA)
