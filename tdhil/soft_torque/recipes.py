@@ -50,8 +50,8 @@ SEARCH_DRAWS = 6
 """Number of truths on which candidates are ranked and finalists are simulated."""
 FINALISTS, MOST_TRIED = 5, 120
 """Number of candidates of one kind that are simulated, and the most that are checked against the margins."""
-_WAVES_SUPPOSED = ("what inertia compensation does to the pipe's waves, and whether their losses keep it stable, is "
-                   "not known of a spring alone: the pipe has to be named (string.yaml)")
+_WAVES_SUPPOSED = ("the string is known as a spring only: the effect of inertia compensation on the waves of the pipe "
+                   "is unknown. State the pipe in string.yaml")
 
 
 def stiff(case: TuneCase) -> Tuned:

@@ -88,6 +88,7 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     assert "broadband refused" in words
     assert "25.02 Speed proportional gain" in words
     assert "--rated-torque" in words
+    assert "Feed-forward of the setpoint's acceleration does not replace it." in words
 
 
 @pytest.mark.parametrize(("words", "said", "code", "message"), [
@@ -137,11 +138,11 @@ def test_without_a_string_k_and_j_l_are_as_the_result_has_them(tuned):
     assert soft["least_damping"]["value"] > 0.1
     own = soft["integral_nm_rad_by_inertia"]
     assert own["low"] / own["value"] == pytest.approx(1.0 - math.hypot(0.04, 0.029), abs=0.002)
-    assert any("describe the pipe in a string.yaml" in warning for warning in document["warnings"])
+    assert any("Describe the pipe in a string.yaml" in warning for warning in document["warnings"])
     # nothing that rests on waves which nobody has seen
     assert [one["kind"] for one in document["controllers"] if one["refused"]] == ["compensated", "broadband"]
     code, document, _ = tuned("--compensate", "0.2", string=None, compliant=compliant())
-    assert code == 11 and "the pipe has to be named" in document["error"]["message"]
+    assert code == 11 and "State the pipe in string.yaml" in document["error"]["message"]
 
 
 @pytest.mark.parametrize(("said", "words"), [
@@ -215,6 +216,8 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     text = written.read_text(encoding="utf-8")
     assert text.count("<svg") == 3
     assert "SIMULATED" in text and "frees a stuck bit and keeps it turning" in text
+    advised = tuning_report(document | {"advice": document["advice"] | {"kind": "soft"}}, None).answer
+    assert "phase margin of 30°, a gain margin of 6 dB and a dead-time reserve of 20 ms" in advised.verdict
     assert write_blocks(tuning_report(document, None), tmp_path / "tune.pdf").read_bytes().startswith(b"%PDF")
 
 
@@ -382,7 +385,7 @@ def test_an_identified_pipe_keeps_its_impedance(tuned):
     assert document["string"]["echo_s"] == pytest.approx(1.888, rel=0.01)
     compensated = next(one for one in document["controllers"] if one["kind"] == "compensated")
     assert not compensated["refused"] or "margin" in compensated["refused"]
-    assert any("the pipe is the one" in warning for warning in document["warnings"])
+    assert any("The string is the uniform pipe" in warning for warning in document["warnings"])
 
 
 def present_of(*words, **said):
@@ -512,7 +515,7 @@ def test_the_operators_map_is_in_the_document_without_a_report(tmp_path, capsys)
 
 def test_a_map_without_its_bit_is_refused(tuned, tmp_path):
     code, document, _ = tuned("--map")
-    assert code == ExitCode.USAGE and "Leave --no-simulation out" in document["error"]["message"]
+    assert code == ExitCode.USAGE and "--no-simulation omits simulations. Leave" in document["error"]["message"]
     code, document, _ = tuned("--map", string=None, model="two-mass", compliant=compliant())
     assert code == ExitCode.USAGE and "--string string.yaml" in document["error"]["message"]
 
