@@ -519,12 +519,16 @@ def _through_filter(
 
 
 def _widened(
-    case: PeriodicCase, finding: Finding, segments: dict[int, _GridSegment], torque: HarmonicTorque, model: _FittedShaft
+    case: PeriodicCase, finding: Finding, segments: dict[int, _GridSegment], torque: HarmonicTorque, delay_s: float
 ) -> Finding:
-    """Return the finding with the part of the harmonics in the uncertainty of J."""
-    if finding.inertia is None:
+    """Return the finding with the part of the harmonics in the uncertainty of J.
+
+    The finding's own model counts: without the harmonics, the data may select another one than with them.
+    """
+    curve = finding.curve
+    if finding.inertia is None or not isinstance(curve, ModelCurve):
         return finding
-    mechanical = model.curve.fitted.problem.model.mechanical
+    theta, mechanical = curve.fitted.likelier.theta, curve.fitted.problem.model.mechanical
     by_segment = {}      # reported lines of each part of the torque, 1 N·m
     for number, segment in segments.items():
         omega: FloatArray = np.asarray(2.0 * np.pi * np.array(case.fits[number].lines_hz), dtype=np.float64)
@@ -534,11 +538,11 @@ def _widened(
         time: FloatArray = np.asarray(period_s / count * np.arange(count), dtype=np.float64)
         waves = [wave(order * segment.angle_rad) for order in torque.orders for wave in (np.cos, np.sin)]
         own = np.array([_lines(time, wave.reshape(segment.periods, -1).mean(axis=0), 0.0, omega) for wave in waves])
-        by_segment[number] = own * filters(model.theta[mechanical:], s)[1] * np.exp(-s * model.delay_s)
-    lines = segment_means(case, model.curve, by_segment)
+        by_segment[number] = own * filters(theta[mechanical:], s)[1] * np.exp(-s * delay_s)
+    lines = segment_means(case, curve, by_segment)
     if not lines:
         return finding
-    rows = inertia_changes(model.curve, model.theta, lines).sum(axis=1)
+    rows = inertia_changes(curve, theta, lines).sum(axis=1)
     half = normal_quantile(case.options.confidence) * math.sqrt(max(float(rows @ torque.covariance @ rows), 0.0))
     return widened(finding, half, "harmonics of the angle", "their amplitudes and phases")
 
@@ -576,6 +580,5 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
             break
         curve = finding.curve
     assert torque is not None
-    finding = _widened(case, finding, segments, torque, replace(model, curve=curve, theta=model.theta)
-                       ) if isinstance(finding.curve, ModelCurve) else finding
+    finding = _widened(case, finding, segments, torque, model.delay_s)
     return case, replace(finding, harmonics=torque.estimates(case.options.confidence))

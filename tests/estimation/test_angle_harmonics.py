@@ -58,6 +58,17 @@ def test_the_harmonic_is_out_of_the_inertia():
 
 
 @pytest.mark.heavy
+def test_another_model_may_be_selected_without_the_harmonic():
+    """The model that is selected after the subtraction has one parameter more: its own count."""
+    rig = Rig(torque_lag=0.01, load_sd=4.081396661692406, sensor_sd=0.02, speed_quantum=0.001, torque_quantum=1.0,
+              speed_poles=(0.02,), torque_poles=(0.01,), harmonics=((6, 0.1 * RATED_NM, -2.351135709653887),))
+    recording = run_over_angle(OverAngle(rig=rig, every=1), range(100, 110))[4]
+    found = identify(recording)
+    assert [one.order for one in found.harmonics] == [6]
+    assert found.inertia.low <= TRUE <= found.inertia.high
+
+
+@pytest.mark.heavy
 def test_nothing_changes_without_a_harmonic():
     for recording in recorded(0, 0.0):
         found, before = identify(recording), identify(replace(recording, position_rad=None))
