@@ -255,7 +255,8 @@ SUBJECTS = {
     "modbus/rtu": _driver("modbus/rtu", "test_modbus_links.py"),
     "modbus/temperature": _driver("modbus/temperature", "test_modbus_temperature.py"),
     "log_writer": Subject(
-        "tdhil/recording/log_writer.py", ("recording/test_writer.py", "recording/test_round_trip.py"),
+        "tdhil/recording/log_writer.py",
+        ("recording/test_writer.py", "recording/test_round_trip.py", "recording/test_export.py"),
         frozenset({
             "STEPPED_QUEUE", "REAL_TIME_QUEUE", "ALIVE_EVERY_S", "_FULL", "RunWriter",
             "POLL_S", "CHUNK_WALL_S", "CHUNK_LOG_NS", "CHUNK_BYTES", "FRAMES", "Pump",
@@ -266,7 +267,7 @@ SUBJECTS = {
         "tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")
     ),
     "log_files": Subject("tdhil/session/log_files.py", ("session/test_log_files.py", "cli/test_identify_end.py")),
-    "service/supervisor": _service("supervisor", "test_lost_drive.py", "test_supervisor.py"),
+    "service/supervisor": _service("supervisor", "test_lost_drive.py", "test_supervisor.py", "test_refused_plainly.py"),
     "service/run_process": _service("run_process", "test_run_process.py", "test_attended.py"),
     "service/access": _service("access", "test_access.py"),
     "service/attendance": _service("attendance", "test_attendance.py"),
@@ -376,6 +377,11 @@ EQUIVALENT = {
        for name in ("service/access", "service/door", "service/supervisor")},
     "session/drive_lock.py, _holder: return None": _FALLS_THROUGH,
     "session/drive_lock.py, _take: time.sleep(0.01)": "a pause between tries: without it they cost a core",
+    "modbus/link.py, module: Serve = Callable[[int, bytes, float], tuple[bytes | None, float]]":
+        "the name of a type; only annotations use it, and mypy needs it",
+    "service/attendance.py, cycle: self._looking = False":
+        "the board keeps the time of the first call: without it, each cycle costs more",
+    "service/store.py, _ensure: with suppress(OSError):": "an index that is known to be good is opened once more",
     "service/audit.py, _verify: return None (last)": _FALLS_THROUGH,
     "service/audit.py, _add: file.flush()": _POWER,
     "service/audit.py, _add: os.fsync(file.fileno())": _POWER,

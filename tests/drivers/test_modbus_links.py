@@ -6,6 +6,7 @@ import socket
 import struct
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -435,6 +436,37 @@ class JunkPort:
 
     def close(self):
         pass
+
+
+@pytest.fixture
+def line_of_junk():
+    """A serial line whose port is set by the test."""
+    peer = SerialPeer(lambda number, request: [])
+    link = RtuLink(peer.device, MonotonicClock(), parity="N")
+    link.close()
+    peer.end()
+    link._lost = ""
+    return link
+
+
+def test_a_reply_that_comes_while_the_line_is_listened_to_is_late(line_of_junk):
+    pieces = iter([b"", rtu(1, OTHER)])
+    line_of_junk._port = SimpleNamespace(in_waiting=0, read=lambda _: next(pieces, b""))
+    line_of_junk._owed, line_of_junk._listen_s = True, LONG_S
+    line_of_junk._come_into_step()
+    assert (line_of_junk.late, line_of_junk._owed, line_of_junk._listen_s) == (1, False, 0.0)
+
+
+def test_a_line_that_was_lost_stays_lost(line_of_junk):
+    """The adapter may come back with another drive behind it, or in mid-frame."""
+    def broken(_frame):
+        raise OSError(5, "Input/output error")
+
+    line_of_junk._port = SimpleNamespace(in_waiting=0, write=broken)
+    for _ in range(2):
+        with pytest.raises(LinkLost, match="Input/output error"):
+            line_of_junk.transact(1, ASK, 0.01)
+        line_of_junk._port = JunkPort(rtu(1, GOOD))
 
 
 @settings(max_examples=60, deadline=None)

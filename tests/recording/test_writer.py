@@ -16,7 +16,7 @@ from tdhil.recording import log_writer
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import CHANNELS, Event
 from tdhil.recording.log_reader import read_run, read_samples
-from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.log_writer import CHUNK_LOG_NS, LAG_S, WAKE_S, Backlog, RunWriter
 from tdhil.recording.mcap_container import Container, LogGone
 from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog
@@ -180,6 +180,30 @@ def test_close_does_not_wait_for_ever(tmp_path):
         writer.close(timeout_s=0.1)
     disk.gate.set()
     writer.close()
+
+
+def test_a_file_that_is_a_little_behind_makes_nobody_wait():
+    backlog = Backlog(10, block=True)
+    backlog.ended = True                               # so that waiting would return
+    backlog.keep_up(0.5 * (WAKE_S + LAG_S))
+    assert (backlog.wake.is_set(), backlog.hurry) == (True, False)
+    backlog.keep_up(LAG_S)
+    assert backlog.hurry
+
+
+def test_a_chunk_ends_by_log_time_and_what_is_in_the_file_is_known(tmp_path):
+    """Stepped time: a second of it takes milliseconds, in which the wall clock closes no chunk."""
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path, epoch_ns=0, block=True)
+    rng = random.Random(1)
+    last = [sample(cycle, rng) for cycle in range(1000)]
+    for one in last:
+        writer.sample(one)
+    writer.close()
+    assert writer._backlog.saved_s == last[-1][0]
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    assert len(chunks) >= 0.9 * (last[-1][0] - last[0][0]) / (1e-9 * CHUNK_LOG_NS)
 
 
 def test_a_quiet_run_reaches_the_disk_too(tmp_path):

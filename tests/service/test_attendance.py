@@ -318,6 +318,11 @@ def test_stages_go_by_and_a_stop_has_its_times(board):
     assert board.status.stop.at_rest is not None
 
 
+def test_the_plan_says_how_long_its_stage_takes(board):
+    Watcher(board).planned(SimpleNamespace(duration_s=100.0))
+    assert board.status.expected_s["acquire"] == 105.0
+
+
 def test_what_a_drive_says_of_itself_is_text(board):
     Watcher(board).preflight(preflight(simulated=True))
     assert "\x1b" not in board.status.identity + board.status.preflight[0].found

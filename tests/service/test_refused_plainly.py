@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tdhil.errors import ExitCode
+from tdhil.errors import ExitCode, LogError
 from tdhil.service import run_state, server, store, supervisor
 from tdhil.service.audit import Audit
 from tdhil.service.schemas import API
@@ -96,6 +96,14 @@ def test_a_full_disk_is_said_in_words(call, service, monkeypatch, what):
     assert "Free some disk space" in found["error"]["next_step"]
 
 
+def test_a_rig_s_file_that_cannot_be_read_is_not_replaced(service, monkeypatch):
+    rig = service.supervisor.rigs.get("a")
+    monkeypatch.setattr(service.supervisor.rigs, "get", lambda _: rig)
+    rig.path.unlink()
+    with pytest.raises(LogError, match="the rig's file can't be read"):
+        service.supervisor.edit_rig("a", "name: other\nrun: {simulate: true}\n", rig.sha256, "anna")
+
+
 def test_a_new_rig_s_file_is_written_as_a_whole_or_not_at_all(service, monkeypatch):
     folder = service.supervisor.rigs.folder
     before = sorted(one.name for one in folder.iterdir())
@@ -104,7 +112,7 @@ def test_a_new_rig_s_file_is_written_as_a_whole_or_not_at_all(service, monkeypat
         with pytest.raises(Exception, match="No space left"):
             service.supervisor.add_rig("new", "run: {simulate: true}\n", "anna")
     assert sorted(one.name for one in folder.iterdir()) == before
-    service.supervisor.add_rig("new", "run: {simulate: true}\n", "anna")
+    assert service.supervisor.add_rig("new", "run: {simulate: true}\n", "anna").id == "new"
     with pytest.raises(run_state.Conflict):
         service.supervisor.add_rig("new", "name: other\nrun: {simulate: true}\n", "anna")
     assert sorted(one.name for one in folder.iterdir()) == sorted([*before, "new.yaml"])

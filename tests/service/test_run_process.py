@@ -212,6 +212,18 @@ def test_a_lease_and_a_code_are_handed_on_as_they_came(tmp_path):
     process.board.close()
 
 
+@pytest.mark.parametrize("state", [State.REFUSED, State.STOPPED])
+def test_a_run_that_ends_during_its_identification_has_failed(tmp_path, state):
+    """Its shaft moved and was stopped: it is neither refused nor stopped."""
+    process = RunProcess(Asked(tmp_path, SIMULATED).folder)
+    for passed in (State.PREFLIGHT, State.MOVING, State.STOPPING, State.IDENTIFYING):
+        process.board.to(passed)
+    assert process.board.status.state is State.IDENTIFYING
+    process._end(state, int(ExitCode.INTERRUPTED))
+    process.board.close()
+    assert process.board.status.state is State.FAILED
+
+
 def test_a_run_whose_motion_is_over_needs_no_page_and_keeps_its_plan(tmp_path, monkeypatch):
     """A page that goes while the result is made stops nothing: the lease has ended before."""
     done: list[str] = []

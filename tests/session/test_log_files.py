@@ -1,8 +1,10 @@
 """A log whose folder is renamed or removed in mid-run: nothing is lost, and what is said names a file that is there."""
 
+import os
 import shutil
 import sys
 import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -22,6 +24,13 @@ def opened(tmp_path):
     yield place, folder
     file.close()
     place._forget()
+
+
+def test_a_device_is_written_to_as_it_is():
+    place = LogPlace(Path(os.devnull))
+    with place.open(place.wanted) as file:
+        assert file.write(b"what was recorded")
+    assert (place.path, place.older, place.live) == (Path(os.devnull), None, False)
 
 
 def test_a_log_that_stays_where_it_is_is_not_looked_for(opened):
