@@ -280,14 +280,15 @@ SUBJECTS = {
     "service/store": _service("store", "test_store.py", "test_supervisor.py"),
     "service/start_request": _service("start_request", "test_attended.py", "test_supervisor.py", "test_api.py"),
     "session/open_drive": Subject(
-        "tdhil/session/open_drive.py", ("path/test_hopeless_plan.py", "api/test_front_door.py")),
+        "tdhil/session/open_drive.py",
+        ("session/test_open_drive.py", "path/test_hopeless_plan.py", "api/test_front_door.py")),
     "session/connection": Subject(
         "tdhil/session/connection.py", ("session/test_modbus_options.py", "session/test_bus_options.py")),
     "session/drive_lock": Subject("tdhil/session/drive_lock.py", ("session/test_drive_lock.py",)),
     "session/confirm": Subject(
         "tdhil/session/confirm.py",
         ("session/test_confirm_speed.py", "session/test_unverified.py", "cli/test_only_the_operator.py",
-         "cli/test_no_watchdog.py"),
+         "cli/test_no_watchdog.py", "calibration/test_calibrate_run.py"),
     ),
     "session/overrides": Subject("tdhil/session/overrides.py", ("session/test_unverified.py",)),
     "session/pace": Subject("tdhil/session/pace.py", ("session/test_pace.py",)),

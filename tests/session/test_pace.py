@@ -1,5 +1,8 @@
 """Whether this computer sustains a rate by the clock: measured with the drive disabled, and said in words."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import pytest
 
 from tdhil.config import resolve
@@ -15,6 +18,22 @@ def test_it_is_said_with_its_limit(late, holds, words):
     assert found.holds is holds
     assert words in found.text and "half a period (5 ms)" in found.text and "12 ms" in found.text
     assert found.plain()["holds"] is holds
+
+
+@pytest.mark.parametrize(("cycle_s", "late"), [(0.010, 0), (0.014, 0), (0.016, 150)])
+def test_a_drive_that_tells_no_delay_is_timed_from_cycle_to_cycle(monkeypatch, cycle_s, late):
+    clock = SimpleNamespace(now_s=5.0)
+
+    def exchange(_command: object) -> None:
+        clock.now_s += cycle_s
+
+    drive = SimpleNamespace(connect=lambda: None, preflight=lambda _: None, period_s=0.01, exchange=exchange)
+    monkeypatch.setattr("tdhil.session.pace.time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    monkeypatch.setattr("tdhil.session.pace.opened_drive", lambda *_: nullcontext(drive))
+    given = {"simulate": True, "real_time": True, "seed": 1}
+    found = measure_pace(*connection_of(given, None, resolve(given, None)), None)
+    assert (found.cycles, found.late) == (150, late)
+    assert found.worst_s == pytest.approx(cycle_s - 0.01, abs=1e-9)
 
 
 @pytest.mark.real_time
