@@ -97,8 +97,8 @@ def test_the_sentence_states_the_worst_case_between_the_depths():
                     "above that of the neighbouring rows.")
     worse = sentence_of(((1500.0, 55.0, 52.0, ()), (2500.0, 28.0, 65.0, ("phase margin 28° (limit 30°)",))),
                         (50.0, 52.0, 40.0))
-    assert worse == ("Interpolated halfway between rows: least phase margin 28° (at 2500 m), margins too small at 2500 m; "
-                     "critical speed at most 25 % above that of the neighbouring rows (at 2500 m).")
+    assert worse == ("Interpolated halfway between rows: least phase margin 28° (at 2500 m), margins too small at 2500 "
+                     "m; critical speed at most 25 % above that of the neighbouring rows (at 2500 m).")
     assert sentence_of((), (50.0,)).startswith("No two neighbouring depths have gains")
 
 
