@@ -230,6 +230,7 @@ def test_what_is_gone_makes_room_before_what_is_open_and_its_address_forgets_it(
     assert list(among) == [idle] and not idle.gone
     assert door._close_one(dict(among)) and idle.gone
     assert "x" not in door._served_of
+    assert door._close_one({}) is False                # nobody is there
 
 
 def test_a_door_that_was_never_opened_can_be_closed():
