@@ -89,6 +89,13 @@ def test_rigs_say_what_they_are(call):
     assert call("GET", "/rigs/a", 200) == found["a"]
 
 
+def test_a_rig_whose_file_cannot_be_used_counts_as_real_and_says_why(service):
+    broken = service.supervisor.rigs.get("broken")
+    with pytest.raises(UsageError, match="broken.yaml:1"):
+        broken.way()
+    assert not broken.simulated
+
+
 def test_a_run_from_its_request_to_its_result(call, service):
     run = call.start()
     assert (run["rig"], run["rig_name"], run["options"]) == ("a", "Rig a", {"note": "done", "seed": 7})
