@@ -91,7 +91,7 @@ def test_rigs_say_what_they_are(call):
 
 def test_a_rig_whose_file_cannot_be_used_counts_as_real_and_says_why(service):
     broken = service.supervisor.rigs.get("broken")
-    with pytest.raises(UsageError, match="broken.yaml:1"):
+    with pytest.raises(UsageError, match=r"broken\.yaml:1"):
         broken.way()
     assert not broken.simulated
 
