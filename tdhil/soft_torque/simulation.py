@@ -294,25 +294,23 @@ class _BitNoise:
         rms = [0.0 if bit is None else bit.noise_nm for bit in bits]
         keep = [float(np.exp(-grid.tick_s / max(1e-9, 1.0 if bit is None else bit.noise_correlation_s)))
                 for bit, grid in zip(bits, grids, strict=True)]
-        # loops with the same seed, rms and correlation have the same noise: it is drawn once
-        loops = list(zip(seeds, rms, keep, strict=True))
-        own = list(dict.fromkeys(loops))
-        first_seeds = list(dict.fromkeys(seeds))
-        self._random = [np.random.default_rng(seed) for seed in first_seeds]
-        self._seed_at = np.array([first_seeds.index(seed) for seed, _, _ in own])
-        self._rms = np.array([one[1] for one in own])
-        self._keep = np.array([one[2] for one in own])
+        # loops with the same seed, rms and correlation have the same noise: it is computed once
+        of_loops = list(zip(seeds, rms, keep, strict=True))
+        noises, different_seeds = list(dict.fromkeys(of_loops)), list(dict.fromkeys(seeds))
+        self._random = [np.random.default_rng(seed) for seed in different_seeds]
+        self._seed_at = np.array([different_seeds.index(seed) for seed, _, _ in noises])
+        self._rms, self._keep = np.array([one[1:] for one in noises]).T
         self._new = np.sqrt(1.0 - self._keep**2)
-        self._own_at = np.repeat([own.index(loop) for loop in loops], repeats)
+        self._noise_at = np.repeat([noises.index(noise) for noise in of_loops], repeats)
         self._state = np.array([random.standard_normal() for random in self._random])[self._seed_at]
-        self._torque_nm: Array = np.empty((0, len(own)))
+        self._torque_nm: Array = np.empty((0, len(noises)))
 
     def at(self, tick: int) -> Array:
         """Return the noise torque during a tick, N·m. Call it for every tick in order."""
         row = tick % NOISE_BLOCK
         if row == 0:
             self._draw_block()
-        found: Array = self._torque_nm[row].take(self._own_at)
+        found: Array = self._torque_nm[row].take(self._noise_at)
         return found
 
     def _draw_block(self) -> None:
@@ -463,8 +461,8 @@ class _Top:
         step[:, 3] /= ticks[:, None]         # the state ∫ω dt becomes the mean speed over the tick
         step[:, :, 3] = 0.0                  # the integral starts again from zero in each tick
         self._step = np.ascontiguousarray(step)
-        self._minus_dry = np.array([-(drive.coulomb_nm + 0.5 * grid.coulomb_nm[0])
-                                    for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
+        self._dry = np.array([drive.coulomb_nm + 0.5 * grid.coulomb_nm[0]
+                              for (drive, _), grid in zip(loops, grids, strict=True)])[:, None]
         self._own_dry = np.array([drive.coulomb_nm for drive, _ in loops])[:, None]
         self._viscous = np.array([drive.viscous_nm_s_rad for drive, _ in loops])[:, None]
         self._state = np.zeros((len(loops), size + 3, speeds))
@@ -492,10 +490,8 @@ class _Top:
         state, size = self._state, self._size
         wave = arriving.reshape(set_speed.shape)
         state[:, size] = wave
-        side = state[:, 0] / SLIDING_BLUR_RAD_S
-        np.minimum(np.maximum(side, -1.0, out=side), 1.0, out=side)
-        side *= self._minus_dry
-        state[:, size + 1] = side + other_nm
+        dry = -self._dry * np.minimum(np.maximum(state[:, 0] / SLIDING_BLUR_RAD_S, -1.0), 1.0)
+        state[:, size + 1] = dry + other_nm
         state[:, size + 2] = set_speed
         after = self._step @ state
         state[:, :size] = after
@@ -572,10 +568,7 @@ class _Bit:
     def _bent(self, speed: Array) -> Array:
         if not self._bends:
             return np.zeros_like(speed)
-        over: Array = speed * speed
-        over *= self._curve
-        np.exp(over, out=over)
-        over *= self._falls
+        over: Array = self._falls * np.exp(speed * speed * self._curve)
         return over
 
 
@@ -604,20 +597,12 @@ class _HeavyBit(_Bit):
         for part in range(self._parts):
             toward = np.where(speed != 0.0, speed, driven)      # has the sign of the motion
             bent = self._bent(speed)
-            friction = self._coulomb + bent
-            end = driven - np.copysign(friction, toward, out=friction)
-            end -= self._viscous * speed
+            net = driven - np.copysign(self._coulomb + bent, toward) - self._viscous * speed
             growth = self._slower
             if self._bends:
-                bent *= np.abs(speed)
-                bent *= self._steeper
-                bent += self._slower
-                bent += LEAST_GROWTH
-                growth = bent
-            end *= self._pace
-            end *= np.expm1(growth)
-            end /= growth
-            end += speed
+                growth = growth + bent * np.abs(speed) * self._steeper
+                growth += LEAST_GROWTH
+            end = speed + net * self._pace * np.expm1(growth) / growth
             # A reversal means that friction drives the bit back. So the bit stops, or does not break away.
             stops = end * toward < 0.0
             if self._rests_harder:

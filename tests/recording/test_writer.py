@@ -196,14 +196,15 @@ def test_a_chunk_ends_by_log_time_and_what_is_in_the_file_is_known(tmp_path):
     path = tmp_path / "run.mcap"
     writer = RunWriter(path, epoch_ns=0, block=True)
     rng = random.Random(1)
-    last = [sample(cycle, rng) for cycle in range(1000)]
-    for one in last:
+    samples = [sample(cycle, rng) for cycle in range(1000)]
+    for one in samples:
         writer.sample(one)
     writer.close()
-    assert writer._backlog.saved_s == last[-1][0]
+    first_s, last_s = samples[0].time_s, samples[-1].time_s
+    assert writer._backlog.saved_s == last_s
     with path.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
-    assert len(chunks) >= 0.9 * (last[-1][0] - last[0][0]) / (1e-9 * CHUNK_LOG_NS)
+    assert len(chunks) >= 0.9 * (last_s - first_s) / (1e-9 * CHUNK_LOG_NS)
 
 
 def test_a_quiet_run_reaches_the_disk_too(tmp_path):
