@@ -6,7 +6,8 @@ mean of all steps, and the figures are those of the fitted loop, without the lag
 **Fit.** P and I are free. All other quantities have the result's intervals as prior knowledge (standard deviation =
 half-width/1.96): J, friction, the lags of the loop together, the resonance, the lag of the reported speed, and the
 delay of the setpoint. An up step and the down step after it make one pair; half their difference is free of offset and
-slow drift. The scatter between pairs gives the covariance of the noise, whatever its spectrum.
+slow drift. The scatter between pairs gives spectrum and covariance of the noise. The rounding of the report is part of
+the model.
 
 **Rows.** Overshoot, rise and settling are compared with their predicted intervals; P and I with the typed values. The
 joint coverage of all intervals is 95 %: each has 1 − 0.05/5.
@@ -41,6 +42,11 @@ NORMAL_95 = 1.96
 REPORT_WIDER = 3.0
 """Factor on the half-width of the reported lag. The steps determine this lag well. A result of tones may contain only
 its difference from the lag of the torque."""
+ROUNDED_AMPLITUDE, QUIET_AMPLITUDE, FEW_COUNTS = 0.5, 0.87, 50.0
+"""Limits of the first harmonic of the rounding error, for steps of fewer counts than `FEW_COUNTS`. Above the first one
+(noise of 0.19 counts), the misfit must be that of noise. Above the second one (0.08 counts) the steps tell nothing: all
+are rounded alike. Study of rounded and truncated responses of 2 to 100 counts with noise of 0.01 to 0.3 counts: each
+wrong verdict is beyond these limits."""
 LEAST_PAIRS = 8
 """Smallest number of pairs of steps. With fewer, their scatter is too uncertain."""
 SETTLED_LAGS, SETTLED_TIMES = 5.0, 2.0
@@ -52,6 +58,12 @@ _DRAWS = 200
 """Number of random draws of the fitted loop, for the intervals of its figures."""
 _SHUFFLES = 300
 """Number of random sign changes of the pairs, for the probability of the misfit."""
+_LEAST_SD, _WHITE_SHARE = 1e-9, 1e-3
+"""Least noise of the mean response, as a share of the step, and least white part of its power."""
+_ROUNDING_HARMONICS = 12
+"""Number of harmonics of the rounding error in the model."""
+_ROUNDING_SD, _ROUNDING_MOST = 0.7, 0.98
+"""Prior standard deviation, and limit, of the amplitude of the first harmonic, as a share of that without noise."""
 _ROUNDS = 12
 """Number of iterations of the fit."""
 _LARGEST_MOVE = 0.4
@@ -200,18 +212,20 @@ class StepVerification:
 class _LoopModel:
     """Model of the reported response. All parameters but ln P and ln I have prior mean 0 and standard deviation 1."""
 
-    def __init__(self, case: StepCase, period_s: float, count: int, half_s: float, timing_sd_s: float,
+    def __init__(self, case: StepCase, program: StepProgram, period_s: float, count: int, timing_sd_s: float,
                  reference_filter_s: float) -> None:
         self.case, self.period_s, self.count = case, period_s, count
-        self._apart = round(half_s / period_s)
+        self._apart = round(program.half_s / period_s)
+        self.counts = program.step_rad_s / program.dither_rad_s if program.dither_rad_s > 0.0 else 0.0
         self._reference_filter_s = reference_filter_s
         self._delay_s = DELAY_CYCLES * period_s, DELAY_SD_CYCLES * period_s + timing_sd_s
         plant = case.plant
         lags = (*plant.lags_s, plant.dead_time_s)
         total = sum(lag.value for lag in lags)
         self._lags_sd = sum(lag.high - lag.low for lag in lags) / (2.0 * NORMAL_95 * total) if total > 0.0 else 0.0
-        self.size = 10
-        """Parameters: ln P, ln I, J, B, lags of the loop, reporting lag, delay, antiresonance, resonance, damping."""
+        self.size = 11
+        """Parameters: ln P, ln I, J, B, lags of the loop, reporting lag, delay, antiresonance, resonance, damping, and
+        rounding of the report."""
 
     def loop(self, theta: Reals) -> tuple[LoopPlant, PiGains]:
         """Return plant and gains for these parameters."""
@@ -245,11 +259,11 @@ class _LoopModel:
                 joined = np.zeros((size + 1, size + 1))
                 joined[:size, :size], joined[size, :size], joined[size, size] = a, c / tau, -1.0 / tau
                 a, b, c = joined, np.append(b, 0.0), np.append(np.zeros(size), 1.0)
-        delay_s = max(0.0, self._delay_s[0] + self._delay_s[1] * float(theta[6]))
+        delay_s = self._delay_s[0] + self._delay_s[1] * float(theta[6])       # below 0 if the sample times are late
         size, length = len(a), self.count + self._apart
         whole = np.zeros((size + 1, size + 1))
         whole[:-1, :-1], whole[:-1, -1] = a, b
-        first = ceil(delay_s / self.period_s - 1e-9)
+        first = max(0, ceil(delay_s / self.period_s - 1e-9))
         out = np.zeros(length)
         state = np.zeros(size + 1)
         state[-1] = 1.0
@@ -261,7 +275,28 @@ class _LoopModel:
             if not abs(out[at]) < 1e6:          # unstable
                 out[at:] = 1e6
                 break
-        return np.asarray(out[:self.count] + 1.0 - out[self._apart:], dtype=np.float64)
+        response = out[:self.count] + 1.0 - out[self._apart:]
+        return np.asarray(response + self._rounding(response, self.rounding_amplitude(theta)), dtype=np.float64)
+
+    def rounding_amplitude(self, theta: Reals) -> float:
+        """Return the amplitude of the first harmonic of the rounding error, as a share of that without noise."""
+        most = _ROUNDING_MOST if self.counts else 0.0
+        return float(np.clip(_ROUNDING_SD * theta[10], -most, most))
+
+    def _rounding(self, response: Reals, amplitude: float) -> Reals:
+        """Return the mean rounding error (N,) of the reported response, as a share of the step.
+
+        A drive rounds speed x, in counts, to Q(x), and Q(x) − x = Σ (−1)^k sin(2πk x)/(πk), with k from 1. Noise of
+        standard deviation s makes the mean of harmonic k e^(−2π²k²s²) = a^(k²) times as large. Truncation in place of
+        rounding gives a negative a, a set speed between two counts a small one. As set speeds are whole counts, the
+        last half count of each response is lost: without this error in the model, the loop seems to settle sooner than
+        it does, and I seems too large.
+        """
+        if not amplitude:
+            return np.zeros_like(response)
+        error = sum((-1.0) ** k * amplitude ** (k * k) * np.sin(2.0 * np.pi * k * self.counts * response) / (np.pi * k)
+                    for k in range(1, _ROUNDING_HARMONICS + 1))
+        return np.asarray(error / self.counts, dtype=np.float64)
 
 
 def _moved(part: Range, by: float) -> float:
@@ -300,7 +335,7 @@ def verify_steps(
     ``timing_sd_s``: standard uncertainty of the sample times; ``reference_filter_s``: known filter of the set speed.
     """
     number, count = pairs.shape
-    model = _LoopModel(case, period_s, count, program.half_s, timing_sd_s, reference_filter_s)
+    model = _LoopModel(case, program, period_s, count, timing_sd_s, reference_filter_s)
     mean: Reals = np.asarray(pairs.mean(axis=0), dtype=np.float64) if number else np.zeros(count)
     time_s: Reals = np.asarray(period_s * np.arange(count), dtype=np.float64)
     start = np.zeros(model.size)
@@ -309,39 +344,64 @@ def verify_steps(
         return StepVerification(StepOutcome.CANNOT_TELL, f"the log has {number} pairs of steps, and {LEAST_PAIRS} are "
                                 "needed", (), number, inf, 0.0, time_s, mean, expected, expected)
     scatter = pairs - mean
-    sd = sqrt(float((scatter**2).sum()) / ((number - 1) * count) / number)
-    sd = max(sd, 1e-9)
-    theta, slopes = _fitted(model, mean, sd)
+    whiten = _whitening(scatter)
+    # The whole response leads near the minimum; its coloured noise decides there.
+    near, _ = _fitted(model, mean, np.eye(count) * sqrt(number) / max(float(scatter.std()), _LEAST_SD), start)
+    theta, slopes = _fitted(model, mean, whiten, near)
     prior = np.diag(np.r_[0.0, 0.0, np.ones(model.size - 2)])
-    inverse = np.linalg.inv(slopes.T @ slopes / sd**2 + prior)
-    moves = scatter @ slopes @ inverse / sd**2
-    covariance = moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
+    inverse = np.linalg.inv(slopes.T @ slopes + prior)
     fitted = model.reported(theta)
     misfit = mean - fitted
     rms = float(np.sqrt(np.mean(misfit**2)))
-    # probability that noise alone gives this misfit, from random signs of the pairs' scatter
+    # what noise alone leaves as misfit, from random signs of the pairs' scatter
+    scatter = scatter @ whiten.T
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (_SHUFFLES, number))
     noise = signs @ scatter / sqrt(number * (number - 1))
-    left = noise - noise @ slopes @ inverse @ slopes.T / sd**2
-    chance = float(np.mean((left**2).sum(axis=1) >= float((misfit**2).sum())))
+    left = ((noise - noise @ slopes @ inverse @ slopes.T) ** 2).sum(axis=1)
+    squares = float(((whiten @ misfit) ** 2).sum())
+    chance = float(np.mean(left >= squares))
+    # A misfit above that of noise is an error of the model, alike in all pairs: Birge's ratio.
+    birge = max(1.0, squares / max(float(np.mean(left)), 1e-18))
+    moves = scatter @ slopes @ inverse
+    covariance = birge * moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
     rows = _rows(model, theta, covariance, number)
-    outcome, reason = _judged(rows, rms, chance, limited=limited)
+    amplitude = abs(model.rounding_amplitude(theta)) if model.counts < FEW_COUNTS else 0.0
+    alike = amplitude > (ROUNDED_AMPLITUDE if chance < UNLIKE_P else QUIET_AMPLITUDE)
+    outcome, reason = _judged(rows, rms, chance, limited=limited, rounded_alike=alike)
     return StepVerification(outcome, reason, rows, number, rms, chance, time_s, mean, fitted, expected)
 
 
-def _fitted(model: _LoopModel, mean: Reals, sd: float) -> tuple[Reals, Reals]:
-    """Fit the parameters. Return them and the derivatives of the response (N, parameter)."""
-    theta = np.zeros(model.size)
+def _whitening(scatter: Reals) -> Reals:
+    """Return the matrix (N, N) that makes the noise of the mean response white, with standard deviation 1.
+
+    The noise of a closed loop is coloured: at low frequency, where I acts, it has 10 to 30 times the mean power. Its
+    autocorrelation is that of the scatter (pair, N), with Parzen's window over half of the response.
+    """
+    from scipy.linalg import solve_triangular, toeplitz
+
+    number, count = scatter.shape
+    power = (np.abs(np.fft.rfft(scatter, 2 * count, axis=1)) ** 2).sum(axis=0)
+    correlation = np.fft.irfft(power)[:count] / (count * number * (number - 1))
+    lag = np.arange(count) / (0.5 * count)
+    window = np.where(lag < 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * np.maximum(0.0, 1.0 - lag) ** 3)
+    correlation *= window
+    correlation[0] += _LEAST_SD**2 + _WHITE_SHARE * correlation[0]
+    root = np.linalg.cholesky(toeplitz(correlation))
+    return np.asarray(solve_triangular(root, np.eye(count), lower=True), dtype=np.float64)
+
+
+def _fitted(model: _LoopModel, mean: Reals, whiten: Reals, theta: Reals) -> tuple[Reals, Reals]:
+    """Fit the parameters from ``theta`` on. Return them and the derivatives of the whitened response (N, parameter)."""
     now = model.reported(theta)
 
     def cost(response: Reals, at: Reals) -> float:
-        return float(((mean - response) ** 2).sum()) / sd**2 + float((at[2:] ** 2).sum())
+        return float(((whiten @ (mean - response)) ** 2).sum()) + float((at[2:] ** 2).sum())
 
     prior = np.r_[0.0, 0.0, np.ones(model.size - 2)]
-    slopes = _slopes(model, theta, now)
+    slopes = whiten @ _slopes(model, theta, now)
     for _ in range(_ROUNDS):
-        hessian = slopes.T @ slopes / sd**2 + np.diag(prior)
-        move = np.linalg.solve(hessian, slopes.T @ (mean - now) / sd**2 - prior * theta)
+        hessian = slopes.T @ slopes + np.diag(prior)
+        move = np.linalg.solve(hessian, slopes.T @ (whiten @ (mean - now)) - prior * theta)
         move *= min(1.0, _LARGEST_MOVE / max(1e-12, float(np.max(np.abs(move[:2])))))
         before = cost(now, theta)
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
@@ -352,7 +412,7 @@ def _fitted(model: _LoopModel, mean: Reals, sd: float) -> tuple[Reals, Reals]:
         else:
             break
         theta, now = tried, there
-        slopes = _slopes(model, theta, now)
+        slopes = whiten @ _slopes(model, theta, now)
         if before - cost(now, theta) < 1e-3:
             break
     return theta, slopes
@@ -382,7 +442,8 @@ def _rows(model: _LoopModel, theta: Reals, covariance: Reals, number: int) -> tu
         gains.append(StepRow(names[3 + k], Range(found, found * exp(-min(half, 50.0)), found * exp(min(half, 50.0))),
                              Range(value, value, value)))
     rng = np.random.default_rng(1)
-    root = np.linalg.cholesky(covariance + 1e-15 * np.eye(len(theta)))
+    variances, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(variances, 0.0))
     draws = [theta, *(theta + root @ one for one in rng.standard_normal((_DRAWS, len(theta))))]
     figures = _figures(model, draws)
     rows = []
@@ -412,10 +473,15 @@ _WORDS = {"overshoot_share": "overshoot", "rise_s": "rise time", "settling_s": "
           "integral_nm_rad": "I"}
 
 
-def _judged(rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bool) -> tuple[StepOutcome, str]:
+def _judged(
+    rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bool, rounded_alike: bool
+) -> tuple[StepOutcome, str]:
     """Return the verdict from the intervals, and its reason."""
     if limited:
         return StepOutcome.CANNOT_TELL, "an internal limit of the drive acted during the steps"
+    if rounded_alike:
+        return StepOutcome.CANNOT_TELL, (
+            "a step is a few counts of the reported speed, and all steps are rounded alike: no noise averages this out")
     if rms > UNLIKE_RMS and chance < UNLIKE_P:
         return StepOutcome.DIFFERS, (
             f"the response differs from that of any P and I on this shaft by {100 * rms:.1f} % of the step (rms): a "

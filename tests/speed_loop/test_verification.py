@@ -31,6 +31,8 @@ ROW = design_speed_loop(SpeedLoopCase(PLANT, bandwidth_hz=2.0)).tuned
 CASE = StepCase("tuned", PLANT, ROW.gains, ROW.overshoot_share, ROW.rise_s, ROW.settling_s, Range(0.3, 0.29, 0.31),
                 "tune.json")
 PROGRAM = StepProgram(4.0, 4.2, round(step_length_s(CASE) / PERIOD_S) * PERIOD_S, 16)
+COUNTS = 10
+ROUNDED = replace(PROGRAM, dither_rad_s=(PROGRAM.high_rad_s - PROGRAM.low_rad_s) / COUNTS)
 PARAMETERS = pytest.mark.parametrize(("proportional", "integral"), [(1.3, 1.0), (0.7, 0.7)])
 
 
@@ -53,8 +55,16 @@ def responses(gains: PiGains, noise: float = 0.02, lag_s: float = 0.3, ramp_s: f
     return one + noise * rng.standard_normal((PROGRAM.pairs, count)) / np.sqrt(2.0)
 
 
-def found(pairs, **said):
-    return verify_steps(CASE, pairs, PROGRAM, PERIOD_S, **said)
+def rounded(gains: PiGains, noise_counts: float, to=np.round, seed: int = 1):
+    """Reported response in each pair of a drive that rounds its speed. Its set speeds are whole counts."""
+    rng = np.random.default_rng(seed)
+    counts = COUNTS * responses(gains, noise=0.0)[0]
+    halves = [to(sign * counts + noise_counts * rng.standard_normal((ROUNDED.pairs, len(counts)))) for sign in (1, -1)]
+    return 0.5 * (halves[0] - halves[1]) / COUNTS
+
+
+def found(pairs, program=PROGRAM, **said):
+    return verify_steps(CASE, pairs, program, PERIOD_S, **said)
 
 
 def test_typed_gains_agree_and_their_intervals_cover_the_truth():
@@ -76,6 +86,41 @@ def test_gains_typed_wrongly_by_30_percent_differ_and_are_named(proportional, in
     assert "P is" in result.reason or "I is" in result.reason
     gain = result.rows[3].measured
     assert gain.low <= wrong.gain_nm_s_rad <= gain.high
+
+
+@pytest.mark.parametrize("to", [np.round, np.floor])
+def test_gains_are_unbiased_where_the_report_is_rounded_to_tenths_of_the_step(to):
+    # Without the rounding in the model, I is 1.3 times too large: the tail below half a count is not reported.
+    errors = []
+    for seed in range(1, 5):
+        *_, proportional, integral = found(rounded(CASE.gains, 0.15, to, seed), ROUNDED).rows
+        for row in (proportional, integral):
+            assert row.within, (row, seed)
+        errors.append(integral.measured.value / CASE.gains.integral_nm_rad - 1.0)
+    assert abs(np.mean(errors)) < 0.03, errors
+
+
+@pytest.mark.parametrize("to", [np.round, np.floor])
+def test_steps_that_are_all_rounded_alike_tell_nothing(to):
+    for seed in range(1, 4):
+        result = found(rounded(CASE.gains, 0.01, to, seed), ROUNDED)
+        assert result.outcome is StepOutcome.CANNOT_TELL, seed
+    assert "rounded alike" in result.reason or "30 %" in result.reason
+
+
+def test_slow_noise_is_weighted_by_its_spectrum():
+    """Noise of 0.5 s correlation time: with equal weights of all samples, the intervals of I are 1.5 times as wide."""
+    widths = []
+    for seed in (1, 3, 5):
+        rng = np.random.default_rng(seed)
+        pairs = responses(CASE.gains, noise=0.005, seed=seed)
+        slow, keep = np.zeros(pairs.shape), np.exp(-PERIOD_S / 0.5)
+        for at in range(1, pairs.shape[1]):
+            slow[:, at] = keep * slow[:, at - 1] + 0.03 * np.sqrt(1.0 - keep**2) * rng.standard_normal(len(pairs))
+        *_, proportional, integral = found(pairs + slow).rows
+        assert proportional.within and integral.within, seed
+        widths.append(integral.measured.high / integral.measured.low)
+    assert np.mean(widths) < 2.4, widths          # 3.1 with equal weights
 
 
 def test_noise_that_hides_30_percent_is_not_called_agreement():
