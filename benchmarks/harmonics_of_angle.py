@@ -12,8 +12,8 @@ within 5°, how often both intervals cover, and the mean error and coverage of J
 
 Required: no order is false. For each order, J with the angle is off by at most 0.5 % on average, beyond what chance
 allows (99 %). At least 95 % of its rows are found, and at least 95 % of these have their amplitude within 10 %, and
-their phase within 5°. Order 36 is judged by this in the rows whose shaft moves by at least `LEAST_COUNTS` in angle;
-the other rows are counted and shown (decision 0060). The exit code is 1 otherwise.
+their phase within 5°. Amplitude and phase are judged in the rows whose shaft moves by at least `least_counts` in angle,
+and so is the finding of order 36; the other rows are counted and shown (decision 0060). The exit code is 1 otherwise.
 """
 
 from __future__ import annotations
@@ -40,17 +40,22 @@ TRUE_KG_M2 = 104.0
 CASES = tuple((order, share) for share in (0.10, 0.03, 0.01) for order in (1, 6, 36))
 BATCH = 10
 COUNT_RAD = 2.0 * math.pi / COUNTS
-FAST = 36                       # order that is judged only where the angle shows it
-LEAST_COUNTS = 0.13
-"""Amplitude of the angle, counts, from which the phase of an order can be within 5° in 95 % of rows.
-
-Rounding to counts has a standard deviation of 1/√12 count. The amplitude over M readings has that of √(2/M) times this,
-and the phase this over the amplitude: 1.96·√(2/M)/√12 ≤ 0.087 rad. M is 5,000: 100 s of the field rig's angle, which is
-read 50 times a second.
-"""
+FAST = 36                       # order that the angle of this rig does not show
+FIELD_READINGS, SERVO_READINGS = 5_000, 25_000     # of the angle in 100 s: 50 and 250 a second
+NORMAL_95 = 1.96                # half-width of a 95 % interval, standard deviations
 LEAST_SHARE = 0.95              # of the rows of an order: found, amplitude, phase
 OFF, OFF_DEG = 0.10, 5.0        # permitted error of amplitude, as a share, and of phase
 MOST_BIAS = 0.005               # of J
+
+
+def least_counts(servo: bool) -> float:
+    """Return the amplitude of the angle, counts, from which the phase of an order can be within 5° in 95 % of rows.
+
+    Rounding to counts has a standard deviation of 1/√12 count. The amplitude over M readings has that of √(2/M) times
+    this, and the phase this over the amplitude: 1.96·√(2/M)/√12 ≤ 0.087 rad. The amplitude's 10 % are a bit wider.
+    """
+    readings = SERVO_READINGS if servo else FIELD_READINGS
+    return NORMAL_95 * math.sqrt(2.0 / readings) / math.sqrt(12.0) / math.radians(OFF_DEG)
 
 
 def rig_of(batch: int, clean: bool) -> tuple[OverAngle, int, float, float]:
@@ -153,16 +158,16 @@ def kept(rows: list[dict[str, Any]]) -> bool:
         bias, half = bias_of(own)
         met = abs(bias) - half <= MOST_BIAS                    # False without a J
         text = f"J off by {100 * bias:+.2f} ± {100 * half:.2f} % on average"
-        there = [row for row in own if order and (order != FAST or row.get("counts", 0.0) >= LEAST_COUNTS)]
-        if len(there) < len(own) and order:
-            text += f", {len(own) - len(there)} of {len(own)} rows below {LEAST_COUNTS:g} counts are not judged further"
-        if there:
-            seen = [row for row in there if row["found"]]
-            shares = {"found": len(seen) / len(there)} | ({} if not seen else {
-                f"±{OFF:.0%}": sum(abs(row["off"]) <= OFF for row in seen) / len(seen),
-                f"±{OFF_DEG:g}°": sum(abs(row["phase_off_deg"]) <= OFF_DEG for row in seen) / len(seen)})
-            met &= all(share >= LEAST_SHARE for share in shares.values())
-            text += "".join(f", {name} {share:.1%}" for name, share in shares.items())
+        clear = [row for row in own if order and row.get("counts", 0.0) >= least_counts(row["servo"])]
+        wanted = clear if order == FAST else own if order else []
+        if len(clear) < len(own) and order:
+            text += f", {len(own) - len(clear)} of {len(own)} rows move the angle by too little for amplitude and phase"
+        shares = {"found": sum(row["found"] for row in wanted) / len(wanted)} if wanted else {}
+        if seen := [row for row in clear if row["found"]]:
+            shares |= {f"±{OFF:.0%}": sum(abs(row["off"]) <= OFF for row in seen) / len(seen),
+                       f"±{OFF_DEG:g}°": sum(abs(row["phase_off_deg"]) <= OFF_DEG for row in seen) / len(seen)}
+        met &= all(share >= LEAST_SHARE for share in shares.values())
+        text += "".join(f", {name} {share:.1%}" for name, share in shares.items())
         print(f"order {order or 'none'}: {text}: {'met' if met else 'NOT MET'}")
         good &= met
     return good
