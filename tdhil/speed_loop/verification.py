@@ -15,7 +15,7 @@ joint coverage of all intervals is 95 %: each has 1 − 0.05/5.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from math import ceil, exp, inf, sqrt
@@ -60,6 +60,8 @@ _SHUFFLES = 300
 """Number of random sign changes of the pairs, for the probability of the misfit."""
 _LEAST_SD, _WHITE_SHARE = 1e-9, 1e-3
 """Least noise of the mean response, as a share of the step, and least white part of its power."""
+_MOST_SAMPLES = 1500
+"""Largest number of samples whose correlation is computed; its time grows with the third power."""
 _ROUNDING_HARMONICS = 12
 """Number of harmonics of the rounding error in the model."""
 _ROUNDING_SD, _ROUNDING_MOST = 0.7, 0.98
@@ -346,7 +348,8 @@ def verify_steps(
     scatter = pairs - mean
     whiten = _whitening(scatter)
     # The whole response leads near the minimum; its coloured noise decides there.
-    near, _ = _fitted(model, mean, np.eye(count) * sqrt(number) / max(float(scatter.std()), _LEAST_SD), start)
+    weight = sqrt(number) / max(float(scatter.std()), _LEAST_SD)
+    near, _ = _fitted(model, mean, lambda x: weight * x, start)
     theta, slopes = _fitted(model, mean, whiten, near)
     prior = np.diag(np.r_[0.0, 0.0, np.ones(model.size - 2)])
     inverse = np.linalg.inv(slopes.T @ slopes + prior)
@@ -354,11 +357,11 @@ def verify_steps(
     misfit = mean - fitted
     rms = float(np.sqrt(np.mean(misfit**2)))
     # what noise alone leaves as misfit, from random signs of the pairs' scatter
-    scatter = scatter @ whiten.T
+    scatter = whiten(scatter.T).T
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (_SHUFFLES, number))
     noise = signs @ scatter / sqrt(number * (number - 1))
     left = ((noise - noise @ slopes @ inverse @ slopes.T) ** 2).sum(axis=1)
-    squares = float(((whiten @ misfit) ** 2).sum())
+    squares = float((whiten(misfit) ** 2).sum())
     chance = float(np.mean(left >= squares))
     # A misfit above that of noise is an error of the model, alike in all pairs: Birge's ratio.
     birge = max(1.0, squares / max(float(np.mean(left)), 1e-18))
@@ -371,37 +374,46 @@ def verify_steps(
     return StepVerification(outcome, reason, rows, number, rms, chance, time_s, mean, fitted, expected)
 
 
-def _whitening(scatter: Reals) -> Reals:
-    """Return the matrix (N, N) that makes the noise of the mean response white, with standard deviation 1.
+def _whitening(scatter: Reals) -> Callable[[Reals], Reals]:
+    """Return a function of (N,) or (N, columns) that makes the noise of the mean response white, with variance 1.
 
     The noise of a closed loop is coloured: at low frequency, where I acts, it has 10 to 30 times the mean power. Its
-    autocorrelation is that of the scatter (pair, N), with Parzen's window over half of the response.
+    autocorrelation is that of the scatter (pair, N), with Parzen's window over half of the response. In a long response,
+    neighbouring samples are averaged.
     """
     from scipy.linalg import solve_triangular, toeplitz
 
-    number, count = scatter.shape
-    power = (np.abs(np.fft.rfft(scatter, 2 * count, axis=1)) ** 2).sum(axis=0)
+    width = ceil(scatter.shape[1] / _MOST_SAMPLES)
+
+    def averaged(x: Reals) -> Reals:
+        whole = len(x) // width
+        return np.asarray(x[:whole * width].reshape(whole, width, *x.shape[1:]).mean(axis=1), dtype=np.float64)
+
+    seen = averaged(scatter.T)
+    count, number = seen.shape
+    power = (np.abs(np.fft.rfft(seen, 2 * count, axis=0)) ** 2).sum(axis=1)
     correlation = np.fft.irfft(power)[:count] / (count * number * (number - 1))
     lag = np.arange(count) / (0.5 * count)
-    window = np.where(lag < 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * np.maximum(0.0, 1.0 - lag) ** 3)
-    correlation *= window
+    correlation *= np.where(lag < 0.5, 1.0 - 6.0 * lag**2 * (1.0 - lag), 2.0 * np.maximum(0.0, 1.0 - lag) ** 3)
     correlation[0] += _LEAST_SD**2 + _WHITE_SHARE * correlation[0]
     root = np.linalg.cholesky(toeplitz(correlation))
-    return np.asarray(solve_triangular(root, np.eye(count), lower=True), dtype=np.float64)
+    return lambda x: np.asarray(solve_triangular(root, averaged(x), lower=True), dtype=np.float64)
 
 
-def _fitted(model: _LoopModel, mean: Reals, whiten: Reals, theta: Reals) -> tuple[Reals, Reals]:
+def _fitted(
+    model: _LoopModel, mean: Reals, whiten: Callable[[Reals], Reals], theta: Reals
+) -> tuple[Reals, Reals]:
     """Fit the parameters from ``theta`` on. Return them and the derivatives of the whitened response (N, parameter)."""
     now = model.reported(theta)
 
     def cost(response: Reals, at: Reals) -> float:
-        return float(((whiten @ (mean - response)) ** 2).sum()) + float((at[2:] ** 2).sum())
+        return float((whiten(mean - response) ** 2).sum()) + float((at[2:] ** 2).sum())
 
     prior = np.r_[0.0, 0.0, np.ones(model.size - 2)]
-    slopes = whiten @ _slopes(model, theta, now)
+    slopes = whiten(_slopes(model, theta, now))
     for _ in range(_ROUNDS):
         hessian = slopes.T @ slopes + np.diag(prior)
-        move = np.linalg.solve(hessian, slopes.T @ (whiten @ (mean - now)) - prior * theta)
+        move = np.linalg.solve(hessian, slopes.T @ whiten(mean - now) - prior * theta)
         move *= min(1.0, _LARGEST_MOVE / max(1e-12, float(np.max(np.abs(move[:2])))))
         before = cost(now, theta)
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
@@ -412,7 +424,7 @@ def _fitted(model: _LoopModel, mean: Reals, whiten: Reals, theta: Reals) -> tupl
         else:
             break
         theta, now = tried, there
-        slopes = whiten @ _slopes(model, theta, now)
+        slopes = whiten(_slopes(model, theta, now))
         if before - cost(now, theta) < 1e-3:
             break
     return theta, slopes
