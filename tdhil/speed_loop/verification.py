@@ -58,6 +58,8 @@ _DRAWS = 200
 """Number of random draws of the fitted loop, for the intervals of its figures."""
 _SHUFFLES = 300
 """Number of random sign changes of the pairs, for the probability of the misfit."""
+_UNSTABLE = 1e6
+"""Response, as a share of the step, from which a loop counts as unstable."""
 _LEAST_SD, _WHITE_SHARE = 1e-9, 1e-3
 """Least noise of the mean response, as a share of the step, and least white part of its power."""
 _MOST_SAMPLES = 1500
@@ -266,17 +268,10 @@ class _LoopModel:
         whole = np.zeros((size + 1, size + 1))
         whole[:-1, :-1], whole[:-1, -1] = a, b
         first = max(0, ceil(delay_s / self.period_s - 1e-9))
-        out = np.zeros(length)
         state = np.zeros(size + 1)
         state[-1] = 1.0
         state = expm(whole * (first * self.period_s - delay_s)) @ state
-        move = expm(whole * self.period_s)
-        for at in range(first, length):
-            out[at] = c @ state[:-1]
-            state = move @ state
-            if not abs(out[at]) < 1e6:          # unstable
-                out[at:] = 1e6
-                break
+        out = np.r_[np.zeros(first), _outputs(expm(whole * self.period_s), np.append(c, 0.0), state, length - first)]
         response = out[:self.count] + 1.0 - out[self._apart:]
         return np.asarray(response + self._rounding(response, self.rounding_amplitude(theta)), dtype=np.float64)
 
@@ -299,6 +294,26 @@ class _LoopModel:
         error = sum((-1.0) ** k * amplitude ** (k * k) * np.sin(2.0 * np.pi * k * self.counts * response) / (np.pi * k)
                     for k in range(1, _ROUNDING_HARMONICS + 1))
         return np.asarray(error / self.counts, dtype=np.float64)
+
+
+def _outputs(move: Reals, c: Reals, state: Reals, length: int) -> Reals:
+    """Return c Aᵏ x (length,), k from 0, for the matrix A and the state x; `_UNSTABLE` from where it is exceeded.
+
+    The outputs of a block, and the states at the start of all blocks, take the root of ``length`` products each.
+    """
+    block = max(1, round(sqrt(length)))
+    rows, states = [c], [state]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(1, block):
+            rows.append(rows[-1] @ move)
+        far = np.linalg.matrix_power(move, block)
+        for _ in range(1, ceil(length / block)):
+            states.append(far @ states[-1])
+        out: Reals = np.asarray((np.array(states) @ np.array(rows).T).ravel()[:length], dtype=np.float64)
+        beyond = np.flatnonzero(~(np.abs(out) < _UNSTABLE))
+    if beyond.size:
+        out[beyond[0]:] = _UNSTABLE
+    return out
 
 
 def _moved(part: Range, by: float) -> float:
@@ -378,8 +393,8 @@ def _whitening(scatter: Reals) -> Callable[[Reals], Reals]:
     """Return a function of (N,) or (N, columns) that makes the noise of the mean response white, with variance 1.
 
     The noise of a closed loop is coloured: at low frequency, where I acts, it has 10 to 30 times the mean power. Its
-    autocorrelation is that of the scatter (pair, N), with Parzen's window over half of the response. In a long response,
-    neighbouring samples are averaged.
+    autocorrelation is that of the scatter (pair, N), with Parzen's window over half of the response.
+    Neighbouring samples of a long response are averaged.
     """
     from scipy.linalg import solve_triangular, toeplitz
 
