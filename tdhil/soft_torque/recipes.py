@@ -24,8 +24,8 @@ from tdhil.soft_torque.controller import (
     stiff_controller,
     tuned_controller,
 )
+from tdhil.soft_torque.critical_speed import longest_integral_time_s
 from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M
-from tdhil.soft_torque.simulation import longest_integral_time_s
 from tdhil.soft_torque.stability import (
     is_stable,
 )

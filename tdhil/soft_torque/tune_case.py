@@ -15,10 +15,8 @@ from tdhil.soft_torque.controller import (
     SpeedController,
     TopDrive,
 )
+from tdhil.soft_torque.critical_speed import Search
 from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.simulation import (
-    Search,
-)
 from tdhil.soft_torque.stability import (
     USUAL_MARGINS,
     LoopMargins,

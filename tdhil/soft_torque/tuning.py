@@ -26,17 +26,17 @@ from tdhil.soft_torque.controller import (
     SpeedController,
     TopDrive,
 )
-from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.recipes import SEARCH_DRAWS, broadband, compensated, soft, stiff
-from tdhil.soft_torque.simulation import (
+from tdhil.soft_torque.critical_speed import (
     LOWEST_NOISY_RPM,
     NOISY_RESOLUTION,
-    RPM,
     Search,
     coarse_tick_s,
     lowest_turning,
     lowest_turning_with_noise,
 )
+from tdhil.soft_torque.drill_string import DrillString
+from tdhil.soft_torque.recipes import SEARCH_DRAWS, broadband, compensated, soft, stiff
+from tdhil.soft_torque.simulation import RPM
 from tdhil.soft_torque.stability import (
     linear_limit,
 )

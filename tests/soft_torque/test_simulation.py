@@ -34,7 +34,8 @@ from tdhil.soft_torque import (
     reflection_at,
     simulate,
 )
-from tdhil.soft_torque.simulation import TopDisturbance, _LightBit, _Top, coarse_tick_s
+from tdhil.soft_torque.critical_speed import coarse_tick_s
+from tdhil.soft_torque.simulation import TopDisturbance, _LightBit, _Top
 from tests.soft_torque.cases import (
     BIT,
     DRIVE,
