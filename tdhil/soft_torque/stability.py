@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, log, pi, sqrt
 
 import numpy as np
@@ -116,14 +117,18 @@ class StringResponse:
     string: DrillString
     omega_rad_s: Reals
     turning: Complex
-    stuck: Complex
+
+    @cached_property
+    def stuck(self) -> Complex:
+        """Return Z_s for a stuck bit. A test for stability alone does not need it."""
+        return self.string.impedance_at(np.asarray(1j * self.omega_rad_s, dtype=np.complex128), stuck=True)
 
 
 def response_of(string: DrillString, highest_rad_s: float) -> StringResponse:
     """Return Z_s on a grid that resolves every resonance of the string up to ``highest_rad_s``."""
     omega = _grid(string, highest_rad_s)
     s: Complex = np.asarray(1j * omega, dtype=np.complex128)
-    return StringResponse(string, omega, string.impedance_at(s), string.impedance_at(s, stuck=True))
+    return StringResponse(string, omega, string.impedance_at(s))
 
 
 def _grid(string: DrillString, highest_rad_s: float) -> Reals:
@@ -168,9 +173,8 @@ def loop_margins(
     rotor = drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad
     least = [inf, inf, inf, inf, inf]
     stable = True
-    loads = ((False, response.turning), (True, response.stuck))
-    for is_stuck, load in loads if stuck else loads[:1]:
-        loop = through / (rotor + load)
+    for is_stuck in (False, True) if stuck else (False,):
+        loop = through / (rotor + (response.stuck if is_stuck else response.turning))
         # Nyquist criterion: rotor and string are passive, so L has no pole in the right half-plane, and the loop is
         # stable if L does not encircle −1. The phase of 1 + L begins between −180° and 0, because L has at most one
         # pole at the origin that is not balanced by losses. It ends at 0 if −1 is not encircled, otherwise at a
