@@ -6,7 +6,7 @@ Always state which critical speed it is (cure or start), and for which bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil, log, log2
 
 import numpy as np
@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController
 from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, Loop, Start, Strings, bit_jumps, simulate
+from tdhil.soft_torque.simulation import (
+    LONGEST_TICK_S,
+    RPM,
+    Array,
+    Begin,
+    Loop,
+    LoopSimulation,
+    Start,
+    Strings,
+    bit_jumps,
+)
 
 
 @dataclass(frozen=True)
@@ -112,37 +122,34 @@ def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
 
 
 def ends_turning(
-    strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search,
+    strings: Strings, loops: Sequence[Loop], how: Start | Sequence[Start], speeds_rpm: Array, search: Search,
     seeds: Sequence[int] | None = None,
 ) -> NDArray[np.bool_]:
     """Return for each loop and speed whether the bit turns in the end: no standstill within the last ``calm_s``.
 
     Both times of ``search`` are lengthened for loops with a long integral time. The duration is at least 2 ``calm_s``.
+    All loops are simulated together, each to its own end: a tick of a few loops costs nearly as much as one of many.
     """
-    found = np.zeros(speeds_rpm.shape, dtype=bool)
-    doubled = np.array([_doubled(controller, search) for _, controller in loops])
-    for times in np.unique(doubled):
-        calm_s = search.calm_s * 2.0 ** int(times)
-        longer = replace(search, calm_s=calm_s, duration_s=max(search.duration_s, 2.0 * calm_s))
-        rows = np.flatnonzero(doubled == times).tolist()
-        found[rows] = _ends_turning(
-            strings if isinstance(strings, DrillString) else [strings[row] for row in rows],
-            [loops[row] for row in rows], how, speeds_rpm[rows], longer,
-            None if seeds is None else [seeds[row] for row in rows])
-    return found
-
-
-def _ends_turning(
-    strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search, seeds: Sequence[int] | None
-) -> NDArray[np.bool_]:
-    """Return the same for loops with one duration."""
-    target = speeds_rpm * RPM
-    begin = Begin(how, np.zeros_like(target) if how == "rest" else target)
-    ramp = search.start_ramp_rpm_s * RPM
-    duration = search.duration_s + (float(target.max()) / ramp if how == "rest" else 0.0)
-    trace = simulate(strings, loops, begin, target, ramp, duration, keep_every_s=duration / 4.0,
-                     longest_tick_s=search.longest_tick_s, disturbance=seeds)
-    turned: NDArray[np.bool_] = trace.last_stuck_s < trace.end_s * (1.0 - search.calm_s / duration)
+    target, ramp = speeds_rpm * RPM, search.start_ramp_rpm_s * RPM
+    simulation = LoopSimulation(strings, loops, Begin(how, target), target, ramp, search.longest_tick_s,
+                                disturbance=seeds)
+    calm_s = search.calm_s * 2.0 ** np.array([_doubled(controller, search) for _, controller in loops])
+    duration_s, rest = np.maximum(search.duration_s, 2.0 * calm_s), np.array(how) == "rest"
+    for one in np.unique(calm_s):      # loops with one calm time end together, after the longest ramp from rest
+        from_rest = rest & (calm_s == one)
+        duration_s[from_rest] += target[from_rest].max(initial=0.0) / ramp
+    ends = np.ceil(duration_s / simulation.grid.tick_s)
+    running, last_stuck = np.arange(len(loops)), np.zeros(target.shape)
+    for end in np.unique(ends):
+        goes_on = ends[running] >= end
+        simulation.keep(goes_on)
+        running = running[goes_on]
+        last = last_stuck[running]
+        while simulation.ticks < end:
+            simulation.advance()
+            np.putmask(last, simulation.bit_rad_s == 0.0, simulation.ticks)
+        last_stuck[running] = last
+    turned: NDArray[np.bool_] = last_stuck < (ends * (1.0 - calm_s / duration_s))[:, None]
     return turned
 
 
@@ -169,7 +176,8 @@ def coarse_tick_s(string: DrillString) -> float:
 
 
 def lowest_turning_with_noise(
-    strings: Sequence[DrillString], loops: Sequence[Loop], seeds: Sequence[int], how: Start, period_s: float
+    strings: Sequence[DrillString], loops: Sequence[Loop], seeds: Sequence[int],
+    how: Start | Sequence[Start], period_s: float,
 ) -> Array:
     """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; infinite: none.
 

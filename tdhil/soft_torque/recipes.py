@@ -11,34 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tdhil.soft_torque.candidates import (
-    SHARES,
-    SOFTNESSES,
-    Candidate,
-    candidates,
-    ranked_speeds,
-)
-from tdhil.soft_torque.controller import (
-    SpeedController,
-    softest_allowed,
-    stiff_controller,
-    tuned_controller,
-)
+from tdhil.soft_torque.candidates import SHARES, SOFTNESSES, Candidate, candidates, ranked_speeds
+from tdhil.soft_torque.controller import SpeedController, softest_allowed, stiff_controller, tuned_controller
 from tdhil.soft_torque.critical_speed import longest_integral_time_s
 from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M
-from tdhil.soft_torque.stability import (
-    is_stable,
-)
+from tdhil.soft_torque.stability import is_stable
 from tdhil.soft_torque.truth_margins import TruthMargins
-from tdhil.soft_torque.tune_case import (
-    TuneCase,
-    Tuned,
-    TuningRefused,
-)
-from tdhil.soft_torque.tuned_figures import (
-    BAND_HZ,
-    reflections,
-)
+from tdhil.soft_torque.tune_case import TuneCase, Tuned, TuningRefused
+from tdhil.soft_torque.tuned_figures import BAND_HZ, reflections
 
 RESERVE = 0.8
 """Largest compensated share of J, divided by the largest stable share."""

@@ -195,8 +195,6 @@ class SimulationTrace:
     """Torque of the drive on the rotor."""
     last_stuck_s: Array
     """Time of the bit's last standstill, (loops, speeds). −1: never."""
-    end_s: Array
-    """End time of the simulation for each loop, (loops, 1)."""
 
 
 @dataclass(frozen=True)
@@ -205,10 +203,11 @@ class Begin:
 
     ``stuck``: the bit is about to break away. The string is twisted by the breakaway torque and stands still. The top
     turns at full speed, and its integral balances the string. ``rest``: everything stands still, without torque.
-    ``turning``: everything turns steadily at one speed.
+    ``turning``: everything turns steadily at one speed. Loops that turn are not simulated together with others.
     """
 
-    how: Start
+    how: Start | Sequence[Start]
+    """One for all loops, or one for each."""
     speed_rad_s: Array
     """Initial speed of the top, (loops, speeds)."""
 
@@ -229,6 +228,76 @@ class TopDisturbance:
         return found
 
 
+class LoopSimulation:
+    """Simulation of every loop at every set speed, tick by tick.
+
+    After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
+    ``disturbance``: seeds of the bit noise, one for each loop, or torque on the rotors; None: neither. All times are
+    for the first string. Raises ValueError if a bit is not stated.
+    """
+
+    def __init__(
+        self, strings: Strings, loops: Sequence[Loop], begin: Begin, target_rad_s: Array, ramp_rad_s2: float,
+        longest_tick_s: float = LONGEST_TICK_S, hold_s: float = 0.0,
+        disturbance: Sequence[int] | TopDisturbance | None = None,
+    ) -> None:
+        every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
+        first_string = every_string[0]
+        self.grid = grid_of(first_string, longest_tick_s)
+        known = {first_string: self.grid}
+        for one in every_string:
+            if one not in known:
+                known[one] = grid_like(one, first_string, self.grid)
+        grids = [known[one] for one in every_string]
+        shape = target_rad_s.shape
+        self.top = _Top(loops, grids, shape[1])
+        self._pipe = PipeSimulation(every_string, grids, shape[1])
+        how = np.array([begin.how] * len(loops) if isinstance(begin.how, str) else begin.how)[:, None]
+        speed = np.where(how == "rest", 0.0, np.broadcast_to(begin.speed_rad_s, shape))
+        if np.any(how == "turning"):
+            held = self._pipe.turn(speed.ravel()).reshape(shape)
+        else:
+            held = np.where(how == "stuck", self._pipe.breakaway_nm.reshape(shape), 0.0)
+            self._pipe.wind_up(held.ravel())
+        self.top.begin(speed, held)
+        self._torque = disturbance if isinstance(disturbance, TopDisturbance) else None
+        self._noise = None
+        if disturbance is not None and not isinstance(disturbance, TopDisturbance):
+            self._noise = _BitNoise(every_string, grids, disturbance, shape[1])
+        self.tick_s = np.array([one.tick_s for one in grids])[:, None]
+        self.set_rad_s, self._target_rad_s = speed, target_rad_s
+        self._ramp = ramp_rad_s2 * self.tick_s
+        self._arrived, self._held_ticks = False, round(hold_s / self.grid.tick_s)
+        self.ticks = 0
+        """Number of ticks that are simulated."""
+
+    @property
+    def bit_rad_s(self) -> Array:
+        """Return the speed of every bit, (loops, speeds)."""
+        return self._pipe.bit_rad_s.reshape(self.set_rad_s.shape)
+
+    def advance(self) -> Array:
+        """Advance by one tick. Return the mean speed of every top over the tick."""
+        if self.ticks >= self._held_ticks and not self._arrived:
+            self.set_rad_s = self.set_rad_s + np.clip(self._target_rad_s - self.set_rad_s, -self._ramp, self._ramp)
+            self._arrived = bool(np.array_equal(self.set_rad_s, self._target_rad_s))
+        other_nm = 0.0 if self._torque is None else self._torque.at(self.ticks * self.grid.tick_s)
+        top_wave, mean_top = self.top.step(self._pipe.at_top(), self.set_rad_s, other_nm)
+        self._pipe.tick(top_wave, None if self._noise is None else self._noise.at(self.ticks))
+        self.ticks += 1
+        return mean_top
+
+    def keep(self, loops: NDArray[np.bool_]) -> None:
+        """Go on with these loops only. Not for a torque on the rotors."""
+        cases = np.repeat(loops, self.set_rad_s.shape[1])
+        self.top.keep(loops)
+        self._pipe.keep(cases)
+        if self._noise is not None:
+            self._noise.keep(cases)
+        self.tick_s, self._ramp = self.tick_s[loops], self._ramp[loops]
+        self.set_rad_s, self._target_rad_s = self.set_rad_s[loops], self._target_rad_s[loops]
+
+
 def simulate(
     strings: Strings,
     loops: Sequence[Loop],
@@ -241,60 +310,23 @@ def simulate(
     hold_s: float = 0.0,
     disturbance: Sequence[int] | TopDisturbance | None = None,
 ) -> SimulationTrace:
-    """Simulate every loop at every set speed, and return the stored signals.
+    """Simulate every loop at every set speed, and return the stored signals: see `LoopSimulation`.
 
-    After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
-    ``disturbance``: seeds of the bit noise, one for each loop, or torque on the rotors; None: neither. All durations
-    are for the first string.
     Raises ValueError if a bit is not stated.
     """
-    every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
-    first_string = every_string[0]
-    grid = grid_of(first_string, longest_tick_s)
-    known = {first_string: grid}
-    for one in every_string:
-        if one not in known:
-            known[one] = grid_like(one, first_string, grid)
-    grids = [known[one] for one in every_string]
-    shape = target_rad_s.shape
-    top = _Top(loops, grids, shape[1])
-    now = np.broadcast_to(begin.speed_rad_s, shape).astype(float).copy()
-    set_speed = now.copy() if begin.how != "rest" else np.zeros(shape)
-    pipe = PipeSimulation(every_string, grids, shape[1])
-    speed, held = np.zeros(shape), np.zeros(shape)
-    if begin.how == "stuck":
-        speed, held = now, pipe.breakaway_nm.reshape(shape)
-        pipe.wind_up(held.ravel())
-    elif begin.how == "turning":
-        speed = now
-        held = pipe.turn(now.ravel()).reshape(shape)
-    top.begin(speed, held)
-    top_torque, noise = None, None
-    if isinstance(disturbance, TopDisturbance):
-        top_torque = disturbance
-    elif disturbance is not None:
-        noise = _BitNoise(every_string, grids, disturbance, shape[1])
-    tick_s = np.array([one.tick_s for one in grids])[:, None]
-    step = ramp_rad_s2 * tick_s
-    count, held_ticks = ceil(duration_s / grid.tick_s), round(hold_s / grid.tick_s)
-    every = max(1, round(keep_every_s / grid.tick_s))
+    running = LoopSimulation(strings, loops, begin, target_rad_s, ramp_rad_s2, longest_tick_s, hold_s, disturbance)
+    tick_s = running.grid.tick_s
+    every = max(1, round(keep_every_s / tick_s))
     kept: list[tuple[float, Array, Array, Array, Array]] = []
-    last: Array = np.full(now.size, -1.0)
-    arrived = False
-    for tick in range(count):
-        if tick >= held_ticks and not arrived:
-            set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
-            arrived = bool(np.array_equal(set_speed, target_rad_s))
-        other_nm = 0.0 if top_torque is None else top_torque.at(tick * grid.tick_s)
-        top_wave, mean_top = top.step(pipe.at_top(), set_speed, other_nm)
-        pipe.tick(top_wave, None if noise is None else noise.at(tick))
-        np.putmask(last, pipe.bit_rad_s == 0.0, tick + 1.0)
+    last: Array = np.full(target_rad_s.shape, -1.0)
+    for tick in range(ceil(duration_s / tick_s)):
+        mean_top = running.advance()
+        np.putmask(last, running.bit_rad_s == 0.0, tick + 1.0)
         if tick % every == 0:
-            kept.append(((tick + 1) * grid.tick_s, set_speed, mean_top, pipe.bit_rad_s.reshape(shape), top.torque_nm))
+            kept.append(((tick + 1) * tick_s, running.set_rad_s, mean_top, running.bit_rad_s, running.top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
-    late = last.reshape(shape)
     return SimulationTrace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
-                           np.where(late < 0.0, late, late * tick_s), count * tick_s)
+                           np.where(last < 0.0, last, last * running.tick_s))
 
 
 class _BitNoise:
@@ -324,6 +356,10 @@ class _BitNoise:
             self._draw_block()
         found: Array = self._torque_nm[row].take(self._noise_at)
         return found
+
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        self._noise_at = self._noise_at[cases]
 
     def _draw_block(self) -> None:
         drawn = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
@@ -381,6 +417,14 @@ class _Waves:
             below = own
             self._sent[:, row] = torque + impedance * speed
             self._sent[:, self._count + row] = impedance * speed - torque
+
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        (self._sent, self._impedance, self._drag, self._coulomb, self._over, self._twice_above, self._twice_below,
+         self._kinetic, self._static, self._moving) = (one.compress(cases, axis=-1) for one in (
+            self._sent, self._impedance, self._drag, self._coulomb, self._over, self._twice_above, self._twice_below,
+            self._kinetic, self._static, self._moving))
+        self._every = self._sent.reshape(-1, self._sent.shape[-1])
 
     def top_torque(self, top_speed: Array) -> Array:
         """Return the string's torque τ just below the rotor, N·m."""
@@ -441,6 +485,12 @@ class PipeSimulation:
         self._waves.fill(load, speed)
         return self.top_torque(speed)
 
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        self._waves.keep(cases)
+        self._bit.keep(cases)
+        self._viscous, self.bit_rad_s = self._viscous[cases], self.bit_rad_s[cases]
+
     def release(self) -> None:
         """Remove the dry friction of the bit, as when it is lifted off bottom."""
         self._bit.release()
@@ -485,6 +535,11 @@ class _Top:
         """Torque of the drive on the rotor, N·m."""
         torque: Array = self._state[:, 3 + self._lags].copy()
         return torque
+
+    def keep(self, loops: NDArray[np.bool_]) -> None:
+        """Go on with these loops only."""
+        self._step, self._state, self._impedance, self._dry, self._own_dry, self._viscous = (
+            one[loops] for one in (self._step, self._state, self._impedance, self._dry, self._own_dry, self._viscous))
 
     def begin(self, speed: Array, string_torque_nm: Array) -> None:
         """Set the top to steady rotation at the set speed. The drive's torque balances the string's."""
@@ -571,6 +626,12 @@ class _Bit:
     def rubbing(self, speed: Array) -> Array:
         """Return the magnitude of the friction torque T_f of the bit alone, N·m."""
         return self._coulomb - self._wall + self._bent(speed)
+
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(self, name, value[cases])
 
     def release(self) -> None:
         """Remove the dry friction of the bit."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from tdhil.soft_torque.controller import (
-    SpeedController,
-)
+from tdhil.soft_torque.controller import SpeedController
 from tdhil.soft_torque.stability import (
     LoopMargins,
     RequiredMargins,
@@ -14,9 +12,7 @@ from tdhil.soft_torque.stability import (
     loop_margins,
     response_of,
 )
-from tdhil.soft_torque.tune_case import (
-    TuneCase,
-)
+from tdhil.soft_torque.tune_case import TuneCase
 
 
 class TruthMargins:
