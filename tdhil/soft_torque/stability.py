@@ -155,6 +155,21 @@ def highest_crossover(drive: TopDrive, law: SpeedController) -> float:
     return float(omega[min(above[-1] + 1, omega.size - 1)]) if above.size else 1.0
 
 
+class StringResponses:
+    """Frequency responses of strings. Each is computed once and kept: gains and J change only its range."""
+
+    def __init__(self) -> None:
+        self._known: dict[DrillString, StringResponse] = {}
+
+    def of(self, string: DrillString, drive: TopDrive, law: SpeedController) -> StringResponse:
+        """Return a response that covers all crossings of that loop."""
+        top = highest_crossover(drive, law)
+        known = self._known.get(string)
+        if known is None or known.omega_rad_s[-1] < 0.98 * top:
+            known = self._known[string] = response_of(string, 1.3 * top)
+        return known
+
+
 def loop_margins(
     drive: TopDrive, law: SpeedController, string: DrillString, response: StringResponse | None = None,
     stuck: bool = True, exact: bool = False,
@@ -202,9 +217,11 @@ def _refined(omega: Reals, size: Reals) -> Reals:
     return merged
 
 
-def is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> bool:
+def is_stable(
+    string: DrillString, drive: TopDrive, law: SpeedController, response: StringResponse | None = None
+) -> bool:
     """Return whether the closed system, with a turning bit, has no pole right of the imaginary axis or on it."""
-    return loop_margins(drive, law, string, stuck=False).stable
+    return loop_margins(drive, law, string, response, stuck=False).stable
 
 
 def _crossings(omega: Reals, loop: Complex) -> tuple[float, float, float, float, float]:
