@@ -41,12 +41,13 @@ if TYPE_CHECKING:
         joint_draws as joint_draws,
     )
     from tdhil.soft_torque.simulation import (
-        Begin as Begin, CriticalSpeeds as CriticalSpeeds, Grid as Grid, RPM as RPM, Search as Search,
-        SimulationTrace as SimulationTrace,
-        critical_speeds as critical_speeds, grid_of as grid_of, lowest_turning as lowest_turning,
-        HIGHEST_NOISY_RPM as HIGHEST_NOISY_RPM, NOISY_RESOLUTION as NOISY_RESOLUTION,
-        bit_jumps as bit_jumps, has_light_bit as has_light_bit, longest_integral_time_s as longest_integral_time_s,
-        lowest_turning_with_noise as lowest_turning_with_noise, simulate as simulate,
+        Begin as Begin, Grid as Grid, RPM as RPM, SimulationTrace as SimulationTrace, bit_jumps as bit_jumps,
+        grid_of as grid_of, has_light_bit as has_light_bit, simulate as simulate,
+    )
+    from tdhil.soft_torque.critical_speed import (
+        CriticalSpeeds as CriticalSpeeds, HIGHEST_NOISY_RPM as HIGHEST_NOISY_RPM, NOISY_RESOLUTION as NOISY_RESOLUTION,
+        Search as Search, critical_speeds as critical_speeds, longest_integral_time_s as longest_integral_time_s,
+        lowest_turning as lowest_turning, lowest_turning_with_noise as lowest_turning_with_noise,
     )
     from tdhil.soft_torque.recipes import largest_stable_share as largest_stable_share
     from tdhil.soft_torque.tune_case import (
@@ -91,9 +92,9 @@ else:
         "roots": "RootsLost count_in roots_in",
         "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
         "uncertainty": "Interval DrawnValues Truth draw_truths independent_axes joint_draws",
-        "simulation": "Begin CriticalSpeeds Grid RPM Search SimulationTrace critical_speeds grid_of lowest_turning "
-                      "HIGHEST_NOISY_RPM NOISY_RESOLUTION bit_jumps has_light_bit longest_integral_time_s "
-                      "lowest_turning_with_noise simulate",
+        "simulation": "Begin Grid RPM SimulationTrace bit_jumps grid_of has_light_bit simulate",
+        "critical_speed": "CriticalSpeeds HIGHEST_NOISY_RPM NOISY_RESOLUTION Search critical_speeds "
+                          "longest_integral_time_s lowest_turning lowest_turning_with_noise",
         "recipes": "largest_stable_share",
         "tune_case": "Advice Moved TUNING_REFUSED TuneCase Tuned Tuning TuningRefused WrongInertia",
         "tuned_figures": "BAND_HZ figures_at in_squares least_damping lowest_modes_below_hz recipe_with "

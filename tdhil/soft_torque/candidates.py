@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, impedance
+from tdhil.soft_torque.critical_speed import longest_integral_time_s
 from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
-from tdhil.soft_torque.simulation import longest_integral_time_s
 from tdhil.soft_torque.stability import bit_grid, bit_impedance, chain_of, linear_limit_rad_s, steepest_slope
 from tdhil.soft_torque.uncertainty import Truth
 

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, TopDrive
+from tdhil.soft_torque.critical_speed import coarse_tick_s
 from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.simulation import RPM, Array, Begin, TopDisturbance, coarse_tick_s, simulate
+from tdhil.soft_torque.simulation import RPM, Array, Begin, TopDisturbance, simulate
 from tdhil.soft_torque.uncertainty import Interval
 from tdhil.soft_torque.virtual_string import SpeedProgram
 

@@ -13,17 +13,10 @@ from numpy.typing import NDArray
 
 from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive
+from tdhil.soft_torque.critical_speed import CALM_INTEGRAL_TIMES, longest_integral_time_s
 from tdhil.soft_torque.disturbed_cure import TRIALS, DisturbedTrials, disturbed_trials
 from tdhil.soft_torque.drill_string import DrillString, StringTolerance
-from tdhil.soft_torque.simulation import (
-    CALM_INTEGRAL_TIMES,
-    LONGEST_TICK_S,
-    RPM,
-    Array,
-    Begin,
-    longest_integral_time_s,
-    simulate,
-)
+from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
 from tdhil.soft_torque.tuned_figures import lowest_modes_below_hz, string_modes_hz
 from tdhil.soft_torque.uncertainty import Interval
 from tdhil.soft_torque.virtual_string import COLUMNS, IdentifiedRig, Phase, SpeedProgram

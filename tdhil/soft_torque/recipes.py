@@ -11,34 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tdhil.soft_torque.candidates import (
-    SHARES,
-    SOFTNESSES,
-    Candidate,
-    candidates,
-    ranked_speeds,
-)
-from tdhil.soft_torque.controller import (
-    SpeedController,
-    softest_allowed,
-    stiff_controller,
-    tuned_controller,
-)
+from tdhil.soft_torque.candidates import SHARES, SOFTNESSES, Candidate, candidates, ranked_speeds
+from tdhil.soft_torque.controller import SpeedController, softest_allowed, stiff_controller, tuned_controller
+from tdhil.soft_torque.critical_speed import longest_integral_time_s
 from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M
-from tdhil.soft_torque.simulation import longest_integral_time_s
-from tdhil.soft_torque.stability import (
-    is_stable,
-)
+from tdhil.soft_torque.stability import StringResponses, is_stable
 from tdhil.soft_torque.truth_margins import TruthMargins
-from tdhil.soft_torque.tune_case import (
-    TuneCase,
-    Tuned,
-    TuningRefused,
-)
-from tdhil.soft_torque.tuned_figures import (
-    BAND_HZ,
-    reflections,
-)
+from tdhil.soft_torque.tune_case import TuneCase, Tuned, TuningRefused
+from tdhil.soft_torque.tuned_figures import BAND_HZ, reflections
 
 RESERVE = 0.8
 """Largest compensated share of J, divided by the largest stable share."""
@@ -102,7 +82,8 @@ def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) ->
         if asked:
             raise TuningRefused(_WAVES_SUPPOSED, where=f"--compensate {asked:g}", next_step="--string string.yaml")
         return [Tuned("compensated", None, _WAVES_SUPPOSED)]
-    largest = largest_stable_share(case, case.softness if case.softness is not None else 0.3, held)
+    softness = case.softness if case.softness is not None else 0.3
+    largest = largest_stable_share(case, softness, held, responses=samples.responses)
     if asked is not None and asked > largest:
         raise TuningRefused(
             f"{100 * asked:.0f} % of J compensated is unstable if J is {_worst(case)}; at most "
@@ -177,7 +158,7 @@ def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> T
     largest = 0.0
     softness: float
     for softness in np.geomspace(0.1, 1.0, 7):
-        here = largest_stable_share(case, float(softness), held)
+        here = largest_stable_share(case, float(softness), held, responses=samples.responses)
         largest = max(largest, here)
         share = RESERVE * here
         if softness > LAG_RESERVE * softest_allowed(case.string, case.drive, held[0], share) or share < 0.05:
@@ -205,23 +186,27 @@ def broadband(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> T
 
 
 def largest_stable_share(
-    case: TuneCase, softness: float, held_hz: Sequence[float], believed_upper: bool = True
+    case: TuneCase, softness: float, held_hz: Sequence[float], believed_upper: bool = True,
+    responses: StringResponses | None = None,
 ) -> float:
     """Return the largest compensated share of the estimated J that is stable over J's and over each other interval.
 
     The resolution is 0.01; 0 means that no share is stable. The gains from the estimated J are checked at both ends of
     J's interval. ``believed_upper``: the gains from its upper end are checked at the estimated J. Each other parameter
     is moved to either end of its interval, with J at its lower end, which allows the least compensation.
+    ``responses``: of the strings, if some were computed before.
     """
     inertia, low, high = case.inertia_kg_m2, 0.0, 1.0
+    responses = responses or StringResponses()
     ends = [end for pair in case.moves(present=False) for end in pair]
     while high - low > 0.01:
         middle = 0.5 * (low + high)
         law = tuned_controller(case.string, inertia.value, softness, held_hz[0], middle)
         upper = tuned_controller(case.string, inertia.high, softness, held_hz[0], middle)
         wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
-        stable = all(is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
-            is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
+        loops = [(case.string, case.drive.with_inertia(true), one) for true, one in wanted]
+        loops += [(end.string, end.drive.with_inertia(inertia.low), law) for end in ends]
+        stable = all(is_stable(*loop, responses.of(*loop)) for loop in loops)
         low, high = (middle, high) if stable else (low, middle)
     return low
 

@@ -38,10 +38,10 @@ No torque limit is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from math import ceil, e, log, log2, pi, sqrt
+from math import ceil, e, pi, sqrt
 from typing import Literal
 
 import numpy as np
@@ -50,6 +50,8 @@ from numpy.typing import NDArray
 from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import DrillString
 
+RPM = 2.0 * pi / 60.0
+"""One revolution per minute, rad/s."""
 LONGEST_TICK_S = 0.006
 SHORTEST_TICK_S = 0.002
 DRAG_EVERY_S = 0.15
@@ -69,6 +71,7 @@ Array = NDArray[np.float64]
 Loop = tuple[TopDrive, SpeedController]
 Strings = DrillString | Sequence[DrillString]
 """One string for all loops, or one for each."""
+Start = Literal["stuck", "rest", "turning"]
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,15 @@ def has_light_bit(string: DrillString, longest_tick_s: float) -> bool:
 def _steepest_fall(falls: Array, width: Array) -> Array:
     """Return the steepest fall of F e^−(ω/ω_s)² over ω, N·m·s/rad: at ω = ω_s/√2."""
     return sqrt(2.0 / e) * falls / width
+
+
+def bit_jumps(string: DrillString, longest_tick_s: float) -> bool:
+    """Return whether a light bit's friction falls more steeply than its line damps: it jumps from speed to speed."""
+    damps, bit = string.lines[-1].impedance_nm_s_rad + string.bottom_viscous_nm_s_rad, string.bit
+    if bit is None or not has_light_bit(string, longest_tick_s):
+        return False
+    falls = np.array(bit.static_nm - bit.coulomb_nm)
+    return bool(_steepest_fall(falls, np.array(bit.stribeck_speed_rad_s)) > damps)
 
 
 def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid:
@@ -183,8 +195,6 @@ class SimulationTrace:
     """Torque of the drive on the rotor."""
     last_stuck_s: Array
     """Time of the bit's last standstill, (loops, speeds). −1: never."""
-    end_s: Array
-    """End time of the simulation for each loop, (loops, 1)."""
 
 
 @dataclass(frozen=True)
@@ -193,10 +203,11 @@ class Begin:
 
     ``stuck``: the bit is about to break away. The string is twisted by the breakaway torque and stands still. The top
     turns at full speed, and its integral balances the string. ``rest``: everything stands still, without torque.
-    ``turning``: everything turns steadily at one speed.
+    ``turning``: everything turns steadily at one speed. Loops that turn are not simulated together with others.
     """
 
-    how: Literal["stuck", "rest", "turning"]
+    how: Start | Sequence[Start]
+    """One for all loops, or one for each."""
     speed_rad_s: Array
     """Initial speed of the top, (loops, speeds)."""
 
@@ -217,6 +228,76 @@ class TopDisturbance:
         return found
 
 
+class LoopSimulation:
+    """Simulation of every loop at every set speed, tick by tick.
+
+    After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
+    ``disturbance``: seeds of the bit noise, one for each loop, or torque on the rotors; None: neither. All times are
+    for the first string. Raises ValueError if a bit is not stated.
+    """
+
+    def __init__(
+        self, strings: Strings, loops: Sequence[Loop], begin: Begin, target_rad_s: Array, ramp_rad_s2: float,
+        longest_tick_s: float = LONGEST_TICK_S, hold_s: float = 0.0,
+        disturbance: Sequence[int] | TopDisturbance | None = None,
+    ) -> None:
+        every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
+        first_string = every_string[0]
+        self.grid = grid_of(first_string, longest_tick_s)
+        known = {first_string: self.grid}
+        for one in every_string:
+            if one not in known:
+                known[one] = grid_like(one, first_string, self.grid)
+        grids = [known[one] for one in every_string]
+        shape = target_rad_s.shape
+        self.top = _Top(loops, grids, shape[1])
+        self._pipe = PipeSimulation(every_string, grids, shape[1])
+        how = np.array([begin.how] * len(loops) if isinstance(begin.how, str) else begin.how)[:, None]
+        speed = np.where(how == "rest", 0.0, np.broadcast_to(begin.speed_rad_s, shape))
+        if np.any(how == "turning"):
+            held = self._pipe.turn(speed.ravel()).reshape(shape)
+        else:
+            held = np.where(how == "stuck", self._pipe.breakaway_nm.reshape(shape), 0.0)
+            self._pipe.wind_up(held.ravel())
+        self.top.begin(speed, held)
+        self._torque = disturbance if isinstance(disturbance, TopDisturbance) else None
+        self._noise = None
+        if disturbance is not None and not isinstance(disturbance, TopDisturbance):
+            self._noise = _BitNoise(every_string, grids, disturbance, shape[1])
+        self.tick_s = np.array([one.tick_s for one in grids])[:, None]
+        self.set_rad_s, self._target_rad_s = speed, target_rad_s
+        self._ramp = ramp_rad_s2 * self.tick_s
+        self._arrived, self._held_ticks = False, round(hold_s / self.grid.tick_s)
+        self.ticks = 0
+        """Number of ticks that are simulated."""
+
+    @property
+    def bit_rad_s(self) -> Array:
+        """Return the speed of every bit, (loops, speeds)."""
+        return self._pipe.bit_rad_s.reshape(self.set_rad_s.shape)
+
+    def advance(self) -> Array:
+        """Advance by one tick. Return the mean speed of every top over the tick."""
+        if self.ticks >= self._held_ticks and not self._arrived:
+            self.set_rad_s = self.set_rad_s + np.clip(self._target_rad_s - self.set_rad_s, -self._ramp, self._ramp)
+            self._arrived = bool(np.array_equal(self.set_rad_s, self._target_rad_s))
+        other_nm = 0.0 if self._torque is None else self._torque.at(self.ticks * self.grid.tick_s)
+        top_wave, mean_top = self.top.step(self._pipe.at_top(), self.set_rad_s, other_nm)
+        self._pipe.tick(top_wave, None if self._noise is None else self._noise.at(self.ticks))
+        self.ticks += 1
+        return mean_top
+
+    def keep(self, loops: NDArray[np.bool_]) -> None:
+        """Go on with these loops only. Not for a torque on the rotors."""
+        cases = np.repeat(loops, self.set_rad_s.shape[1])
+        self.top.keep(loops)
+        self._pipe.keep(cases)
+        if self._noise is not None:
+            self._noise.keep(cases)
+        self.tick_s, self._ramp = self.tick_s[loops], self._ramp[loops]
+        self.set_rad_s, self._target_rad_s = self.set_rad_s[loops], self._target_rad_s[loops]
+
+
 def simulate(
     strings: Strings,
     loops: Sequence[Loop],
@@ -229,60 +310,23 @@ def simulate(
     hold_s: float = 0.0,
     disturbance: Sequence[int] | TopDisturbance | None = None,
 ) -> SimulationTrace:
-    """Simulate every loop at every set speed, and return the stored signals.
+    """Simulate every loop at every set speed, and return the stored signals: see `LoopSimulation`.
 
-    After ``hold_s``, the set speed ramps from its value in ``begin`` to ``target_rad_s``, shape (loops, speeds).
-    ``disturbance``: seeds of the bit noise, one for each loop, or torque on the rotors; None: neither. All durations
-    are for the first string.
     Raises ValueError if a bit is not stated.
     """
-    every_string = [strings] * len(loops) if isinstance(strings, DrillString) else list(strings)
-    first_string = every_string[0]
-    grid = grid_of(first_string, longest_tick_s)
-    known = {first_string: grid}
-    for one in every_string:
-        if one not in known:
-            known[one] = grid_like(one, first_string, grid)
-    grids = [known[one] for one in every_string]
-    shape = target_rad_s.shape
-    top = _Top(loops, grids, shape[1])
-    now = np.broadcast_to(begin.speed_rad_s, shape).astype(float).copy()
-    set_speed = now.copy() if begin.how != "rest" else np.zeros(shape)
-    pipe = PipeSimulation(every_string, grids, shape[1])
-    speed, held = np.zeros(shape), np.zeros(shape)
-    if begin.how == "stuck":
-        speed, held = now, pipe.breakaway_nm.reshape(shape)
-        pipe.wind_up(held.ravel())
-    elif begin.how == "turning":
-        speed = now
-        held = pipe.turn(now.ravel()).reshape(shape)
-    top.begin(speed, held)
-    top_torque, noise = None, None
-    if isinstance(disturbance, TopDisturbance):
-        top_torque = disturbance
-    elif disturbance is not None:
-        noise = _BitNoise(every_string, grids, disturbance, shape[1])
-    tick_s = np.array([one.tick_s for one in grids])[:, None]
-    step = ramp_rad_s2 * tick_s
-    count, held_ticks = ceil(duration_s / grid.tick_s), round(hold_s / grid.tick_s)
-    every = max(1, round(keep_every_s / grid.tick_s))
+    running = LoopSimulation(strings, loops, begin, target_rad_s, ramp_rad_s2, longest_tick_s, hold_s, disturbance)
+    tick_s = running.grid.tick_s
+    every = max(1, round(keep_every_s / tick_s))
     kept: list[tuple[float, Array, Array, Array, Array]] = []
-    last: Array = np.full(now.size, -1.0)
-    arrived = False
-    for tick in range(count):
-        if tick >= held_ticks and not arrived:
-            set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
-            arrived = bool(np.array_equal(set_speed, target_rad_s))
-        other_nm = 0.0 if top_torque is None else top_torque.at(tick * grid.tick_s)
-        top_wave, mean_top = top.step(pipe.at_top(), set_speed, other_nm)
-        pipe.tick(top_wave, None if noise is None else noise.at(tick))
-        np.putmask(last, pipe.bit_rad_s == 0.0, tick + 1.0)
+    last: Array = np.full(target_rad_s.shape, -1.0)
+    for tick in range(ceil(duration_s / tick_s)):
+        mean_top = running.advance()
+        np.putmask(last, running.bit_rad_s == 0.0, tick + 1.0)
         if tick % every == 0:
-            kept.append(((tick + 1) * grid.tick_s, set_speed, mean_top, pipe.bit_rad_s.reshape(shape), top.torque_nm))
+            kept.append(((tick + 1) * tick_s, running.set_rad_s, mean_top, running.bit_rad_s, running.top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
-    late = last.reshape(shape)
     return SimulationTrace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
-                           np.where(late < 0.0, late, late * tick_s), count * tick_s)
+                           np.where(last < 0.0, last, last * running.tick_s))
 
 
 class _BitNoise:
@@ -312,6 +356,10 @@ class _BitNoise:
             self._draw_block()
         found: Array = self._torque_nm[row].take(self._noise_at)
         return found
+
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        self._noise_at = self._noise_at[cases]
 
     def _draw_block(self) -> None:
         drawn = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
@@ -369,6 +417,14 @@ class _Waves:
             below = own
             self._sent[:, row] = torque + impedance * speed
             self._sent[:, self._count + row] = impedance * speed - torque
+
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        (self._sent, self._impedance, self._drag, self._coulomb, self._over, self._twice_above, self._twice_below,
+         self._kinetic, self._static, self._moving) = (one.compress(cases, axis=-1) for one in (
+            self._sent, self._impedance, self._drag, self._coulomb, self._over, self._twice_above, self._twice_below,
+            self._kinetic, self._static, self._moving))
+        self._every = self._sent.reshape(-1, self._sent.shape[-1])
 
     def top_torque(self, top_speed: Array) -> Array:
         """Return the string's torque τ just below the rotor, N·m."""
@@ -429,6 +485,12 @@ class PipeSimulation:
         self._waves.fill(load, speed)
         return self.top_torque(speed)
 
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        self._waves.keep(cases)
+        self._bit.keep(cases)
+        self._viscous, self.bit_rad_s = self._viscous[cases], self.bit_rad_s[cases]
+
     def release(self) -> None:
         """Remove the dry friction of the bit, as when it is lifted off bottom."""
         self._bit.release()
@@ -473,6 +535,11 @@ class _Top:
         """Torque of the drive on the rotor, N·m."""
         torque: Array = self._state[:, 3 + self._lags].copy()
         return torque
+
+    def keep(self, loops: NDArray[np.bool_]) -> None:
+        """Go on with these loops only."""
+        self._step, self._state, self._impedance, self._dry, self._own_dry, self._viscous = (
+            one[loops] for one in (self._step, self._state, self._impedance, self._dry, self._own_dry, self._viscous))
 
     def begin(self, speed: Array, string_torque_nm: Array) -> None:
         """Set the top to steady rotation at the set speed. The drive's torque balances the string's."""
@@ -559,6 +626,12 @@ class _Bit:
     def rubbing(self, speed: Array) -> Array:
         """Return the magnitude of the friction torque T_f of the bit alone, N·m."""
         return self._coulomb - self._wall + self._bent(speed)
+
+    def keep(self, cases: NDArray[np.bool_]) -> None:
+        """Go on with these cases only."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(self, name, value[cases])
 
     def release(self) -> None:
         """Remove the dry friction of the bit."""
@@ -658,192 +731,3 @@ class _LightBit(_Bit):
             rests |= (speed * driven <= 0.0) & (torque <= self.static_nm)
         end = np.where(rests, 0.0, np.copysign(found, driven))
         return 2.0 * self._impedance * end - arriving, end
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Critical speeds. Always state which one (cure or start), and for which bit.
-
-
-RPM = 2.0 * pi / 60.0
-"""One revolution per minute, rad/s."""
-
-
-@dataclass(frozen=True)
-class CriticalSpeeds:
-    """Critical speeds of the main shaft without bit noise, rpm. None: above the highest speed that was tried."""
-
-    cure_rpm: float | None
-    """Lowest set speed at which a stuck bit (about to break away, the top at full set speed) turns in the end."""
-    start_rpm: float | None
-    """Lowest set speed at which the bit turns in the end after a ramp from standstill."""
-
-
-@dataclass(frozen=True)
-class Search:
-    """Settings of the search for critical speeds."""
-
-    highest_rpm: float = 240.0
-    lowest_rpm: float = 0.0
-    coarse_rpm: float = 16.0
-    resolution_rpm: float = 1.0
-    duration_s: float = 100.0
-    calm_s: float = 20.0
-    """Time at the end of a simulation. The bit counts as turning if it does not stand still in this time. Both times
-    are longer for a loop with a long integral time (`ends_turning`)."""
-    start_ramp_rpm_s: float = 5.0
-    longest_tick_s: float = LONGEST_TICK_S
-
-
-def critical_speeds(strings: Strings, loops: Sequence[Loop], search: Search = Search()) -> list[CriticalSpeeds]:
-    """Return the critical speeds of every loop. Raises ValueError if no bit is stated."""
-    cures = lowest_turning(strings, loops, "stuck", search)
-    starts = lowest_turning(strings, loops, "rest", search)
-    return [CriticalSpeeds(*two) for two in zip(cures, starts, strict=True)]
-
-
-Start = Literal["stuck", "rest", "turning"]
-
-# A loop with a long integral time Tn = P/I has a slow stick-slip cycle. While the bit sticks, the torque rises by I
-# times the set speed. Once free, the top turns (F_s − F_c)/P too fast, and this excess decays with Tn. So a bit that
-# will stick again turns for up to three Tn. With a shorter end of the simulation, it counts as turning.
-CALM_INTEGRAL_TIMES = 3.0
-"""Least `Search.calm_s`, in integral times. Two are too few for P = 373 and I = 16 on the reference string (Tn = 24 s):
-33 rpm instead of 34. From three to ten, the result is the same."""
-MOST_DOUBLED = 3
-"""Largest number of times that `Search.calm_s` is doubled: a simulation is up to four times as long."""
-
-
-def longest_integral_time_s(mode_hz: float) -> float:
-    """Return the longest integral time that a search under bit noise can judge, s: eight periods of the lowest mode."""
-    return CALM_PERIODS / mode_hz * 2.0**MOST_DOUBLED / CALM_INTEGRAL_TIMES
-
-
-def _doubled(controller: SpeedController, search: Search) -> int:
-    """Return how often `Search.calm_s` is doubled for this controller."""
-    ratio = CALM_INTEGRAL_TIMES * controller.integral_time_s / search.calm_s
-    return ceil(log2(min(max(ratio, 1.0), 2.0**MOST_DOUBLED)) - 1e-9)
-
-
-def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
-    """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; None: not found.
-
-    The search uses a coarse grid first. Then it divides the step between the highest speed that sticks and the next one
-    above, down to the resolution.
-    """
-    span = search.highest_rpm - search.lowest_rpm
-    coarse = np.linspace(search.lowest_rpm, search.highest_rpm, max(1, ceil(span / search.coarse_rpm - 1e-9)) + 1)
-
-    def turn(speeds_rpm: Array) -> NDArray[np.bool_]:
-        return ends_turning(strings, loops, how, np.maximum(speeds_rpm, 0.5 * search.resolution_rpm), search)
-
-    found = _lowest(turn, np.tile(coarse, (len(loops), 1)), float(coarse[1] - coarse[0]) / search.resolution_rpm)
-    return [None if one == np.inf else float(max(one, 0.5 * search.resolution_rpm)) for one in found]
-
-
-def _lowest(turn: Callable[[Array], NDArray[np.bool_]], coarse: Array, parts: float) -> Array:
-    """Return for each row the lowest value from which on all turn; infinite: none. Resolution: step / ``parts``.
-
-    ``coarse``: evenly spaced values; each row is a loop. A row in which the last value does not turn is refined like
-    the others, and its result is not used. All values of a bracket are simulated together: the time that a simulation
-    takes depends on its ticks much more than on the number of its speeds.
-    """
-    first = np.array([_first_of_the_rest(row) for row in turn(coarse)])
-    rows, count = np.arange(len(coarse)), ceil(parts - 1e-9)
-    found = coarse[rows, np.minimum(first, coarse.shape[1] - 1)]
-    if count > 1:
-        step = float(coarse[0, 1] - coarse[0, 0])
-        between = found[:, None] + step * (np.arange(1, count) / count - 1.0)
-        at = [_first_of_the_rest(row) for row in turn(between)]
-        found = np.column_stack([between, found])[rows, at]      # the bracket's upper end turns
-    return np.where(first < coarse.shape[1], found, np.inf)
-
-
-def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
-    """Return the index from which on all are true. If the last is false, return the length of ``turns``."""
-    sticking = np.flatnonzero(~turns)
-    return int(sticking[-1]) + 1 if sticking.size else 0
-
-
-def ends_turning(
-    strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search,
-    seeds: Sequence[int] | None = None,
-) -> NDArray[np.bool_]:
-    """Return for each loop and speed whether the bit turns in the end: no standstill within the last ``calm_s``.
-
-    Both times of ``search`` are lengthened for loops with a long integral time. The duration is at least 2 ``calm_s``.
-    """
-    found = np.zeros(speeds_rpm.shape, dtype=bool)
-    doubled = np.array([_doubled(controller, search) for _, controller in loops])
-    for times in np.unique(doubled):
-        calm_s = search.calm_s * 2.0 ** int(times)
-        longer = replace(search, calm_s=calm_s, duration_s=max(search.duration_s, 2.0 * calm_s))
-        rows = np.flatnonzero(doubled == times).tolist()
-        found[rows] = _ends_turning(
-            strings if isinstance(strings, DrillString) else [strings[row] for row in rows],
-            [loops[row] for row in rows], how, speeds_rpm[rows], longer,
-            None if seeds is None else [seeds[row] for row in rows])
-    return found
-
-
-def _ends_turning(
-    strings: Strings, loops: Sequence[Loop], how: Start, speeds_rpm: Array, search: Search, seeds: Sequence[int] | None
-) -> NDArray[np.bool_]:
-    """Return the same for loops with one duration."""
-    target = speeds_rpm * RPM
-    begin = Begin(how, np.zeros_like(target) if how == "rest" else target)
-    ramp = search.start_ramp_rpm_s * RPM
-    duration = search.duration_s + (float(target.max()) / ramp if how == "rest" else 0.0)
-    trace = simulate(strings, loops, begin, target, ramp, duration, keep_every_s=duration / 4.0,
-                     longest_tick_s=search.longest_tick_s, disturbance=seeds)
-    turned: NDArray[np.bool_] = trace.last_stuck_s < trace.end_s * (1.0 - search.calm_s / duration)
-    return turned
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Critical speeds under bit noise: many strings, each with its own noise, on a geometric grid of speeds.
-
-TICKS_PER_WAY, LONGEST_NOISY_TICK_S = 30.0, 0.03
-"""Limits of the tick in a search over many strings: at most a thirtieth of the travel time down, and at most 0.03 s.
-The cure speeds of the reference case are the same for ticks of 0.006 s and 0.03 s."""
-COARSE_SPEEDS, FINE_PARTS = 7, 16
-"""Number of speeds of the first grid, and number of parts of one of its steps that the search resolves."""
-PERIODS, CALM_PERIODS = 12.0, 3.0
-"""Length of a simulation, and length of its end in which the bit must not stand still; both in periods of the string's
-lowest mode with the top held."""
-LOWEST_NOISY_RPM, HIGHEST_NOISY_RPM = 10.0, 240.0
-NOISY_RESOLUTION = (HIGHEST_NOISY_RPM / LOWEST_NOISY_RPM) ** (1.0 / ((COARSE_SPEEDS - 1) * FINE_PARTS)) - 1.0
-"""Relative resolution of a critical speed under noise: 3 %."""
-
-
-def bit_jumps(string: DrillString, longest_tick_s: float) -> bool:
-    """Return whether a light bit's friction falls more steeply than its line damps: it jumps from speed to speed."""
-    damps, bit = string.lines[-1].impedance_nm_s_rad + string.bottom_viscous_nm_s_rad, string.bit
-    if bit is None or not has_light_bit(string, longest_tick_s):
-        return False
-    falls = np.array(bit.static_nm - bit.coulomb_nm)
-    return bool(_steepest_fall(falls, np.array(bit.stribeck_speed_rad_s)) > damps)
-
-
-def coarse_tick_s(string: DrillString) -> float:
-    """Return the longest tick, s, for the search for critical speeds of that string; finer for a bit that jumps."""
-    tick_s = min(LONGEST_NOISY_TICK_S, 0.5 * string.echo_s / TICKS_PER_WAY)
-    return min(tick_s, LONGEST_TICK_S) if bit_jumps(string, tick_s) else tick_s
-
-
-def lowest_turning_with_noise(
-    strings: Sequence[DrillString], loops: Sequence[Loop], seeds: Sequence[int], how: Start, period_s: float
-) -> Array:
-    """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; infinite: none.
-
-    ``period_s``: period of the lowest mode with the top held. Every loop has its own string and seed. Raises ValueError
-    if a bit is not stated.
-    """
-    search = Search(duration_s=PERIODS * period_s, calm_s=CALM_PERIODS * period_s,
-                    longest_tick_s=coarse_tick_s(strings[0]))
-    coarse = np.linspace(log(LOWEST_NOISY_RPM), log(HIGHEST_NOISY_RPM), COARSE_SPEEDS)
-
-    def turn(logs: Array) -> NDArray[np.bool_]:
-        return ends_turning(strings, loops, how, np.exp(logs), search, seeds)
-
-    found: Array = np.exp(_lowest(turn, np.tile(coarse, (len(loops), 1)), FINE_PARTS))
-    return found

@@ -15,14 +15,8 @@ from typing import Literal
 import numpy as np
 
 from tdhil.soft_torque.controller import SpeedController
-from tdhil.soft_torque.simulation import (
-    CALM_PERIODS,
-    PERIODS,
-    Search,
-    Start,
-    coarse_tick_s,
-    ends_turning,
-)
+from tdhil.soft_torque.critical_speed import CALM_PERIODS, PERIODS, Search, coarse_tick_s, ends_turning
+from tdhil.soft_torque.simulation import Start
 from tdhil.soft_torque.tune_case import Tuning
 
 MAP_SPEEDS_RPM = tuple(float(one) for one in range(20, 221, 20))

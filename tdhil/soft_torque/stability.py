@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, log, pi, sqrt
 
 import numpy as np
@@ -116,14 +117,18 @@ class StringResponse:
     string: DrillString
     omega_rad_s: Reals
     turning: Complex
-    stuck: Complex
+
+    @cached_property
+    def stuck(self) -> Complex:
+        """Return Z_s for a stuck bit. A test for stability alone does not need it."""
+        return self.string.impedance_at(np.asarray(1j * self.omega_rad_s, dtype=np.complex128), stuck=True)
 
 
 def response_of(string: DrillString, highest_rad_s: float) -> StringResponse:
     """Return Z_s on a grid that resolves every resonance of the string up to ``highest_rad_s``."""
     omega = _grid(string, highest_rad_s)
     s: Complex = np.asarray(1j * omega, dtype=np.complex128)
-    return StringResponse(string, omega, string.impedance_at(s), string.impedance_at(s, stuck=True))
+    return StringResponse(string, omega, string.impedance_at(s))
 
 
 def _grid(string: DrillString, highest_rad_s: float) -> Reals:
@@ -150,6 +155,21 @@ def highest_crossover(drive: TopDrive, law: SpeedController) -> float:
     return float(omega[min(above[-1] + 1, omega.size - 1)]) if above.size else 1.0
 
 
+class StringResponses:
+    """Frequency responses of strings. Each is computed once and kept: gains and J change only its range."""
+
+    def __init__(self) -> None:
+        self._known: dict[DrillString, StringResponse] = {}
+
+    def of(self, string: DrillString, drive: TopDrive, law: SpeedController) -> StringResponse:
+        """Return a response that covers all crossings of that loop."""
+        top = highest_crossover(drive, law)
+        known = self._known.get(string)
+        if known is None or known.omega_rad_s[-1] < 0.98 * top:
+            known = self._known[string] = response_of(string, 1.3 * top)
+        return known
+
+
 def loop_margins(
     drive: TopDrive, law: SpeedController, string: DrillString, response: StringResponse | None = None,
     stuck: bool = True, exact: bool = False,
@@ -168,9 +188,8 @@ def loop_margins(
     rotor = drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad
     least = [inf, inf, inf, inf, inf]
     stable = True
-    loads = ((False, response.turning), (True, response.stuck))
-    for is_stuck, load in loads if stuck else loads[:1]:
-        loop = through / (rotor + load)
+    for is_stuck in (False, True) if stuck else (False,):
+        loop = through / (rotor + (response.stuck if is_stuck else response.turning))
         # Nyquist criterion: rotor and string are passive, so L has no pole in the right half-plane, and the loop is
         # stable if L does not encircle −1. The phase of 1 + L begins between −180° and 0, because L has at most one
         # pole at the origin that is not balanced by losses. It ends at 0 if −1 is not encircled, otherwise at a
@@ -198,9 +217,11 @@ def _refined(omega: Reals, size: Reals) -> Reals:
     return merged
 
 
-def is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> bool:
+def is_stable(
+    string: DrillString, drive: TopDrive, law: SpeedController, response: StringResponse | None = None
+) -> bool:
     """Return whether the closed system, with a turning bit, has no pole right of the imaginary axis or on it."""
-    return loop_margins(drive, law, string, stuck=False).stable
+    return loop_margins(drive, law, string, response, stuck=False).stable
 
 
 def _crossings(omega: Reals, loop: Complex) -> tuple[float, float, float, float, float]:

@@ -2,21 +2,9 @@
 
 from __future__ import annotations
 
-from tdhil.soft_torque.controller import (
-    SpeedController,
-)
-from tdhil.soft_torque.stability import (
-    LoopMargins,
-    RequiredMargins,
-    StringResponse,
-    highest_crossover,
-    least_of,
-    loop_margins,
-    response_of,
-)
-from tdhil.soft_torque.tune_case import (
-    TuneCase,
-)
+from tdhil.soft_torque.controller import SpeedController
+from tdhil.soft_torque.stability import LoopMargins, RequiredMargins, StringResponses, least_of, loop_margins
+from tdhil.soft_torque.tune_case import TuneCase
 
 
 class TruthMargins:
@@ -24,15 +12,11 @@ class TruthMargins:
 
     def __init__(self, case: TuneCase) -> None:
         self.truths = case.truths()
-        self._responses: dict[int, StringResponse] = {}
+        self.responses = StringResponses()
 
     def margins(self, number: int, law: SpeedController) -> LoopMargins:
         truth = self.truths[number]
-        top = highest_crossover(truth.drive, law)
-        known = self._responses.get(number)
-        if known is None or known.omega_rad_s[-1] < 0.98 * top:
-            known = self._responses[number] = response_of(truth.string, 1.3 * top)
-        return loop_margins(truth.drive, law, truth.string, known)
+        return loop_margins(truth.drive, law, truth.string, self.responses.of(truth.string, truth.drive, law))
 
     def every(self, law: SpeedController | None) -> LoopMargins:
         """Return the least of each margin over all truths. ``law`` None: each truth's present gains are used."""

@@ -9,21 +9,10 @@ from math import inf
 import numpy as np
 
 from profiles import MessageCode, TdhilError
-from tdhil.soft_torque.controller import (
-    Margins,
-    NaturalMode,
-    SpeedController,
-    TopDrive,
-)
+from tdhil.soft_torque.controller import Margins, NaturalMode, SpeedController, TopDrive
+from tdhil.soft_torque.critical_speed import Search
 from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.simulation import (
-    Search,
-)
-from tdhil.soft_torque.stability import (
-    USUAL_MARGINS,
-    LoopMargins,
-    RequiredMargins,
-)
+from tdhil.soft_torque.stability import USUAL_MARGINS, LoopMargins, RequiredMargins
 from tdhil.soft_torque.uncertainty import DrawnValues, Interval, Truth, draw_truths
 
 TUNING_REFUSED = 11

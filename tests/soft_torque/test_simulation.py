@@ -25,6 +25,7 @@ from tdhil.soft_torque import (
     TuneCase,
     Tuned,
     Tuning,
+    critical_speed,
     critical_speeds,
     grid_of,
     has_light_bit,
@@ -34,7 +35,8 @@ from tdhil.soft_torque import (
     reflection_at,
     simulate,
 )
-from tdhil.soft_torque.simulation import TopDisturbance, _LightBit, _Top, coarse_tick_s
+from tdhil.soft_torque.critical_speed import coarse_tick_s
+from tdhil.soft_torque.simulation import LoopSimulation, TopDisturbance, _LightBit, _Top
 from tests.soft_torque.cases import (
     BIT,
     DRIVE,
@@ -252,6 +254,30 @@ def test_slow_stick_slip_against_the_chain():
             laws=[(SLOW.gain_nm_s_rad, SLOW.integral_nm_rad, SLOW.compensated_kg_m2, 0.05)],
             **{key: value for key, value in reference_case(noise_nm=noise_nm, inertia=104.2).items() if key != "laws"})
         assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_loops_with_different_starts_and_ends_are_simulated_together_as_each_alone(monkeypatch):
+    """A stuck bit, a ramp from rest, a short and a long integral time: one simulation, each loop to its own end."""
+    string = replace(STRING, bit=replace(STRING.bit, noise_nm=500.0))
+    search = Search(duration_s=6.0, calm_s=1.0, start_ramp_rpm_s=20.0, longest_tick_s=0.03)
+    loops, seeds = [(DRIVE, STIFF), (LIGHT, SLOW), (DRIVE, SOFT_1), (LIGHT, SLOW), (DRIVE, HALF)], [1, 2, 1, 3, 4]
+    starts, speeds = ["stuck", "rest", "rest", "stuck", "rest"], np.tile([20.0, 35.0, 60.0, 90.0], (5, 1))
+    begun = []
+
+    class Counted(LoopSimulation):
+        def __init__(self, *given, **named):
+            super().__init__(*given, **named)
+            begun.append(self)
+
+    monkeypatch.setattr(critical_speed, "LoopSimulation", Counted)
+    together = critical_speed.ends_turning([string] * 5, loops, starts, speeds, search, seeds)
+    (simulation,) = begun
+    alone = [critical_speed.ends_turning([string], [loops[k]], starts[k], speeds[[k]], search, [seeds[k]])[0]
+             for k in range(5)]
+    assert together.tolist() == np.array(alone).tolist()
+    assert together.any() and not together.all()
+    ticks = [one.ticks for one in begun[1:]]
+    assert simulation.ticks == max(ticks) and len(set(ticks)) == 4
 
 
 def test_gains_whose_stick_slip_may_be_too_slow_are_told():

@@ -10,13 +10,16 @@ import pytest
 from tdhil.soft_torque import (
     RPM,
     ClosedSystem,
+    DrillString,
     RootsLost,
     SpeedController,
     TopDrive,
+    is_stable,
     linear_limit,
     loop_margins,
 )
 from tdhil.soft_torque.roots import count_right_of
+from tdhil.soft_torque.stability import highest_crossover, response_of
 from tests.soft_torque.cases import DRIVE, HALF, STIFF, STRING, TABLE, Pipe, lumped_chain, string_with
 
 
@@ -141,3 +144,19 @@ def test_unstable_loops_have_no_margin():
     found = loop_margins(DRIVE, law, STRING)
     assert not found.stable
     assert (found.phase_deg, found.gain_db, found.dead_time_s) == (0.0, 0.0, 0.0)
+
+
+def test_whether_a_loop_is_stable_needs_no_response_with_a_stuck_bit(monkeypatch):
+    """The response of a stuck bit is computed once, and only if its margins are asked for."""
+    asked = []
+    original = DrillString.impedance_at
+
+    def counted(self, s, *, stuck=False):
+        asked.append(stuck)
+        return original(self, s, stuck=stuck)
+
+    monkeypatch.setattr(DrillString, "impedance_at", counted)
+    assert is_stable(STRING, DRIVE, HALF) and asked == [False]
+    response = response_of(STRING, highest_crossover(DRIVE, HALF))
+    assert loop_margins(DRIVE, HALF, STRING, response) == loop_margins(DRIVE, HALF, STRING, response)
+    assert asked == [False, False, True]

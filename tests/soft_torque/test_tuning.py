@@ -22,11 +22,13 @@ from tdhil.soft_torque import (
     least_damping,
     loop_margins,
     lowest_turning,
+    stability,
     string_modes_hz,
     tune,
     tuned_controller,
 )
 from tdhil.soft_torque.candidates import gains, ranked_speeds
+from tdhil.soft_torque.stability import StringResponses, response_of
 from tests.soft_torque.cases import DRIVE, SOFT_025, STRING
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
@@ -263,3 +265,21 @@ def test_profiles_that_know_their_speed_controller_are_not_asked_about_it_before
     profile = load_profile(name)
     assert profile.speed_controller is not None
     assert not any("speed_controller" in entry for entry, _ in profile.entries())
+
+
+def test_the_frequency_response_of_a_string_is_computed_once_for_all_shares(monkeypatch):
+    """Each share has its own gains, but the string is the same. A response that covers their crossings is kept."""
+    made = []
+
+    def counted(string, highest_rad_s):
+        made.append(string)
+        return response_of(string, highest_rad_s)
+
+    monkeypatch.setattr(stability, "response_of", counted)
+    longer = (Moved(inner_lags_s=(0.005,)), Moved(inner_lags_s=(0.08, 0.03)))
+    responses = StringResponses()
+    first = largest_stable_share(case(also=(longer,)), 0.3, HELD, responses=responses)
+    count = len(made)
+    assert set(made) == {STRING} and count <= 3
+    assert largest_stable_share(case(also=(longer,)), 0.3, HELD, responses=responses) == first
+    assert len(made) == count
