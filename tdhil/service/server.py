@@ -333,7 +333,7 @@ def _listen(host: str, port: int) -> socket.socket:
     from tdhil.service.door import BACKLOG
 
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    found = socket.socket(family, socket.SOCK_STREAM)
+    found = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     if hasattr(socket, "TCP_NOTSENT_LOWAT"):       # small buffer for slow readers: see ON_ITS_WAY
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, ON_ITS_WAY)

@@ -24,7 +24,7 @@ from starlette.routing import Route
 
 from tdhil.service import door as door_module
 from tdhil.service.door import HEADERS_S, Door, Room, Seldom, raise_limit
-from tdhil.service.server import Tls
+from tdhil.service.server import Tls, _listen
 from tests.service.conftest import HANGS_S, wait_for
 
 ROOM = Room(waiting=8, waiting_of_one=4, served=6, served_of_one=3)
@@ -47,7 +47,7 @@ class Served:
     def __init__(self, room: Room = ROOM, tls: ssl.SSLContext | None = None) -> None:
         self.time_s = 0.0
         self.said: list[str] = []
-        self.listening = socket.create_server(("127.0.0.1", 0))
+        self.listening = _listen("127.0.0.1", 0)
         self.address = self.listening.getsockname()
         self.door = Door(self.listening, room, self.said.append, tls=tls, clock=lambda: self.time_s)
         self._ready, self._end = threading.Event(), threading.Event()
@@ -133,6 +133,13 @@ def test_a_request_gets_its_answer_in_pieces_and_one_after_the_other(served):
     client.sendall(HEADER + b"\r\n")                  # the same connection once more
     assert answered(client)
     assert (served.door.waiting, served.door.served, served.said) == (0, 1, [])
+
+
+def test_a_reply_does_not_wait_for_the_client_to_acknowledge_its_header(served):
+    """Nagle's algorithm would hold back the body until then: the delayed acknowledgement of a client takes 40 ms."""
+    assert answered(served.connect(sent=HEADER + b"\r\n"))
+    (one,) = served.door._served
+    assert one.transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 @pytest.mark.parametrize("sent", [b"", HEADER])

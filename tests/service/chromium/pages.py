@@ -6,7 +6,6 @@ import asyncio
 import json
 import os
 import shutil
-import socket
 import threading
 from dataclasses import asdict
 from html import escape
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from tdhil.service.server import _listen
 from tdhil.service.store import write_json
 from tests.recording.test_log_tail import write
 from tests.service.conftest import Service, wait_for
@@ -47,8 +47,7 @@ class Served:
         import uvicorn
 
         self.service = service
-        listening = socket.socket()
-        listening.bind(("127.0.0.1", 0))
+        listening = _listen("127.0.0.1", 0)
         self.url = f"http{'s' if cert else ''}://127.0.0.1:{listening.getsockname()[1]}"
         config = uvicorn.Config(service.web.asgi, log_level="error", ws="websockets-sansio",
                                 timeout_graceful_shutdown=1, ssl_certfile=cert, ssl_keyfile=key)
