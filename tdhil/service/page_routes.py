@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,8 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse, Response
-from starlette.routing import BaseRoute, Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.routing import BaseRoute, Route
 
 from tdhil.config import OPTION, STATED, Option, Origin, Setting, form_options
 from tdhil.errors import TdhilError
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 HERE: Final = Path(str(files("tdhil.service")))
 _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
 """Pattern of addresses to which a login may redirect: paths of this service only."""
-
-
+_MEDIA: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 AS_RIG: Final = "as rig.yaml, else "
 """First part of the text of an empty field whose value the rig's file may state (`Option.form_hint`)."""
 
@@ -89,18 +88,21 @@ class Pages:
         self._site = site
         self._languages = languages()
         self._templates: dict[str, Environment] = {}
+        self._files = {f"/static/{one.name}": one.read_bytes() for one in (HERE / "static").iterdir()}
+        self._files |= {f"/texts/{tag}.js": one.script().encode() for tag, one in self._languages.items()}
+        # A browser keeps a file whose address has the hash of its content: another content has another address.
+        self._kept = {path: f"{path}?{sha256(found).hexdigest()[:16]}" for path, found in self._files.items()}
         for tag, language in self._languages.items():
             # In a template ``_("text")`` is a text, and ``word(text)`` one that varies.
             found = Environment(
                 loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
-                trim_blocks=True, lstrip_blocks=True,
-            )
+                trim_blocks=True, lstrip_blocks=True)
             found.globals.update(
                 version=__version__, stop_s=STOP_S, form_options=form_options,
                 stated_options=[OPTION[name] for name in STATED],
                 language=language, languages=self._languages.values(),
-                graphs=GRAPHS, _=language.text, word=language.word, hint=partial(_hint, language),
-                applies=partial(_applies, language), about=partial(_about, language),
+                graphs=GRAPHS, kept=self._kept.__getitem__, _=language.text, word=language.word,
+                hint=partial(_hint, language), applies=partial(_applies, language), about=partial(_about, language),
                 code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
                 speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
             found.filters["number"] = language.number
@@ -110,7 +112,7 @@ class Pages:
         """Return a page in the language of the request. ``here``: the page's entry in the menu."""
         templates = self._templates[language_of(request, self._languages)]
         text = templates.get_template(template).render(
-            here=here, who=principal(request), login=self._site.access.login, **known)
+            here=here, query=request.url.query, who=principal(request), login=self._site.access.login, **known)
         return HTMLResponse(text, status, {"vary": "Accept-Language, Cookie"})
 
     def routes(self) -> list[BaseRoute]:
@@ -135,27 +137,22 @@ class Pages:
             self._page("/accounts", "accounts.html", "accounts"),
             self._page("/docs", "docs.html", "docs"),
             Route("/login", self._login),
-            Route("/texts/{language}.js", self._texts),
             Route("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
-            Mount("/static", StaticFiles(directory=HERE / "static")),
+            *(Route(f"/{folder}/{{name}}", self._file) for folder in ("static", "texts")),
         ]
 
     def _page(self, path: str, template: str, here: str, role: Role = "viewer") -> Route:
         site = self._site
+        view_of: Mapping[str, Callable[[str], Any]] = {
+            "rig": lambda rig: site.rig_view(site.supervisor.rig(rig)), "run": site.run_view, "fleet": site.fleets.get}
 
         async def serve(request: Request) -> Response:
             require(principal(request), role, route=request.url.path, open_here=not site.access.login)
             known: dict[str, Any] = {}
-            if "rig" in request.path_params:
-                known["rig"] = await off(
-                    lambda: site.rig_view(site.supervisor.rig(request.path_params["rig"])))
-            if "run" in request.path_params:
-                known["run"] = await off(lambda: site.run_view(request.path_params["run"]))
-            if "fleet" in request.path_params:
-                known["fleet"] = await off(lambda: site.fleets.get(request.path_params["fleet"]))
+            for name, one in request.path_params.items():
+                known[name] = await off(partial(view_of[name], one))
             if template == "start.html":
-                known["settings"] = await off(
-                    lambda: _settings(site.supervisor.rigs.get(request.path_params["rig"])))
+                known["settings"] = await off(lambda: _settings(site.supervisor.rigs.get(request.path_params["rig"])))
             if template in ("rigs.html", "new_rig.html"):
                 known["folder"] = site.supervisor.rigs.folder is not None
                 known["built_in"] = await off(lambda: site.supervisor.rigs.built_in)
@@ -165,10 +162,12 @@ class Pages:
 
         return Route(path, serve)
 
-    async def _texts(self, request: Request) -> Response:
-        if (found := self._languages.get(request.path_params["language"])) is None:
+    async def _file(self, request: Request) -> Response:
+        if (found := self._files.get(path := request.url.path)) is None:
             raise HTTPException(404)
-        return Response(found.script(), media_type="text/javascript")
+        kept = f"{path}?{request.url.query}" == self._kept[path]
+        return Response(found, media_type=_MEDIA.get(Path(path).suffix, "text/plain"),
+                        headers={"cache-control": "max-age=31536000, immutable"} if kept else None)
 
     async def _login(self, request: Request) -> Response:
         there = request.query_params.get("next", "/")

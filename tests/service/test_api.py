@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import hashlib
 import json
 import os
 import re
@@ -498,6 +499,21 @@ def test_nothing_but_its_own_files_is_served(client, service):
         assert answer.status_code in (404, 400), path
         assert "s3cret" not in answer.text
         assert "import" not in answer.text
+
+
+def test_a_browser_keeps_a_file_whose_address_has_the_hash_of_its_content(client):
+    addresses = re.findall(r'(?:href|src)="(/(?:static|texts)/[^"]+)"', client.get("/").text)
+    assert {"/static/app.js", "/static/app.css", "/static/icon.svg", "/texts/en.js"} < {
+        one.partition("?")[0] for one in addresses}
+    for address in addresses:
+        path, _, digest = address.partition("?")
+        answer = client.get(address)
+        assert answer.headers["cache-control"] == "max-age=31536000, immutable", address
+        assert hashlib.sha256(answer.content).hexdigest()[:16] == digest
+        for other in (path, f"{path}?{digest[::-1]}"):             # a page of another version: never kept
+            assert client.get(other).headers["cache-control"] == "no-store"
+    for path in ("/", "/runs", f"{API}/rigs"):
+        assert client.get(path).headers["cache-control"] == "no-store"
 
 
 # -- whence

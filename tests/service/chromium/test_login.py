@@ -122,7 +122,7 @@ def test_a_page_from_before_a_new_login_still_stops(page, served):
 def test_a_page_whose_script_does_not_come_sends_nothing(browser, served):
     context = browser.new_context(base_url=served.url, ignore_https_errors=True)
     page = context.new_page()
-    page.route("**/static/app.js", lambda route: route.abort())
+    page.route("**/static/app.js?*", lambda route: route.abort())
     page.goto("/login")
     page.keyboard.type("operator\n")
     assert page.locator("main").evaluate("one => one.inert && !one.contains(document.activeElement)")
