@@ -370,6 +370,8 @@ def _figures(document: Part) -> list[str]:
     """Return the names of all rows and columns of the card and the page."""
     names = [name for name, _ in (*_rests_on(document), *_rows(document))]
     names += ["in brackets", "*", "draws", *(one["kind"] for one in document["controllers"])]
+    if any(name.endswith("wrong") for name in names):
+        names.append("errors of J")
     if document.get("schedule"):
         names += schedule_headings(document["schedule"])
     if document.get("map"):
@@ -526,9 +528,9 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         sections.append(settings_section(settings))
     if document.get("schedule"):
         sections.append(schedule_section(document["schedule"]))
-    rests: list[tuple[str, str]] = list(_rests_on(document))
-    rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
-    sections += [ReportSection("Basis of the result", (Pairs(tuple(rests)),)), meanings_section(_figures(document))]
+    of_page = [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
+    sections += [ReportSection("Basis of the result", (Pairs((*_rests_on(document), *of_page)),)),
+                 meanings_section([*_figures(document), *(name for name, _ in of_page)])]
     simulated = document["tuned_for"]["simulated"]
     return Report(
         title="Speed controller and drill string",

@@ -43,7 +43,8 @@ from tests.soft_torque.test_evaluation import rows
 
 OWN_NAMES = {"Run", "Trials", "To be typed into the drive, by hand"}
 """Sections whose names are those of the run or of the drive."""
-OF_FILES = {"from", "profile"}
+OF_PAGE = {"from", "profile"}
+"""Rows that a page has and a card has not."""
 
 
 def speeds(rpm):
@@ -85,7 +86,7 @@ def names_of(page):
                 shown += [column.title for column in block.columns]
                 if section.heading != "The operator's map" and "depth, m" not in shown[-len(block.columns):]:
                     shown += [row[0] for row in block.rows]
-    return [name for name in shown if name and name not in OF_FILES], explained
+    return [name for name in shown if name], explained
 
 
 def figures_of(names):
@@ -124,7 +125,9 @@ def test_each_figure_is_explained_once():
 def test_figures_of_a_tuning(tuned):
     text = shown_by(print_tuning, tuned)
     page = tuning_report(tuned, None)
-    check(page, text, names_of(page)[0])
+    check(page, text, [name for name in names_of(page)[0] if name not in OF_PAGE])
+    assert set(names_of(page)[1]) >= {*OF_PAGE, "errors of J"}
+    assert "examples: both are errors of the acceleration regression" in text
     assert "bit noise" in text and "200 N·m rms" in text and "reserve" in text
     assert "ψ" not in text          # a symbol of damping in other texts, not the mark of a footnote
     words = " ".join(text.split())
