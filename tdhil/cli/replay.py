@@ -45,11 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
 
 
-def add_trace_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for reading a trace in CSV. A default of None means: not given."""
+def add_trace_arguments(parser: argparse.ArgumentParser, *, motion: bool = True) -> None:
+    """Add the options for reading a trace in CSV. A default of None means: not given.
+
+    ``motion``: with the options of a periodic motion. They have no effect on a command that fits none.
+    """
     trace = parser.add_argument_group("a trace in CSV (a run.mcap contains all this)")
     for option in OF_A_TRACE:
-        if option.joined:
+        if not motion and option.name.startswith(("motion_", "excitation")):
+            parser.set_defaults(**{option.name: None})
+        elif option.joined:
             trace.add_argument(option.flag, dest=option.name, nargs="+", metavar=option.metavar,
                                help=option.help_text.replace("%", "%%"))
         else:

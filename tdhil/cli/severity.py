@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_option(parser, OPTION["json"])
     add_report_option(parser, "severity")
     add_head_options(parser)
-    add_trace_arguments(parser)
+    add_trace_arguments(parser, motion=False)
     parser.set_defaults(run=run)
 
 

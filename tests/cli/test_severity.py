@@ -55,6 +55,13 @@ def test_j_of_a_rehearsal_marks_what_is_computed_from_it(bench, capsys):
     assert "· SIMULATED · FAULT REHEARSAL" in " ".join(ran(bench, capsys)[1].split())
 
 
+@pytest.mark.parametrize("option", ["--excitation", "--motion-kind", "--motion-lines"])
+def test_options_of_a_motion_are_not_accepted(bench, capsys, option):
+    """A record of ordinary drilling has no periodic motion, and nothing is fitted to one."""
+    code, _, err = ran(bench, capsys, option, "sine")
+    assert code == 2 and f"there is no option {option}" in err
+
+
 @pytest.mark.heavy
 def test_two_records_side_by_side_in_80_columns_and_as_a_page(bench, capsys):
     code, out, err = ran(bench, capsys, "--against", str(bench / "after.csv"), "--report", str(bench / "page.html"))
