@@ -513,7 +513,7 @@ class ModelResult:
     An estimate is None if the model does not have the quantity, or if the data contradict the model.
     """
 
-    model: str = "none"                                 # paper, rigid+lags, two-mass, string, before-echo
+    model: str = "none"                                 # paper, rigid+lags[, bent friction], two-mass, string
     viscous_nm_s_rad: Estimate | None = None
     coulomb_nm: Estimate | None = None                  # constant load included
     speed_lag_s: Estimate | None = None
