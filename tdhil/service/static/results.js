@@ -366,12 +366,13 @@
       const people = (one) => [one.operator, one.note].filter(Boolean).join(": ");
       const filtered = [...query.keys()].some((one) => !TURNED.includes(one) && one !== "archived");
       show(byId("runs"), ...(found.runs.length ? found.runs.map((one) => {
-        const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: `${one.rig || NO_RIG}, ${when(one.asked)}` }), disabled: one.verdict === null });
+        const at = when(one.asked), rig = one.rig || NO_RIG, name = `${rig}, ${at}`;
+        const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: name }), disabled: one.verdict === null });
         box.checked = chosen.has(one.id);
         box.addEventListener("change", () => { if (box.checked) chosen.set(one.id, one.rehearsal); else chosen.delete(one.id); said(); });
         return el("tr", {}, el("td", { class: "pick" }, box),
-          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": `${one.rig || NO_RIG}, ${when(one.asked)}` }, one.rig || NO_RIG), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
-          el("td", {}, when(one.asked)), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict ? word(one.verdict, "verdict") : ""),
+          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": name }, rig), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
+          el("td", {}, at), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict ? word(one.verdict, "verdict") : ""),
           el("td", {}, people(one), ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, tr("ARCHIVED"))] : [])));
       }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, found.total ? tr("no run on this page") : filtered ? tr("no run matches") : tr("no run yet")))]));
       const last = found.first + found.runs.length - 1;
@@ -387,7 +388,7 @@
       for (const one of heads) if (one.dataset.key === key) one.parentElement.setAttribute("aria-sort", way); else one.parentElement.removeAttribute("aria-sort");
     }
     async function look() {
-      const mine = ++asking, next = await call("GET", `/runs/page?${query}`), now = JSON.stringify(next) + query;
+      const mine = ++asking, next = await call("GET", `/runs/page${location.search}`), now = JSON.stringify(next) + query;
       if (mine !== asking || now === shown) return;          // a later request is on its way; or keep the keyboard focus
       shown = now;
       found = next;
