@@ -137,8 +137,8 @@ def judged(seed: int) -> dict[str, Any]:
     drive = plant["drive"]
     row: dict[str, Any] = {"seed": seed, "noise": noise, "refused": None, "shaft": "two-mass" if two_mass else "rigid"}
     lags = (stated(rng, drive["speed_filter_s"]), stated(rng, drive["torque_lag_s"]))
-    # A cycle of the control, held for one: from half of one to two.
-    dead = Range(CONTROL_PERIOD_S, 0.5 * CONTROL_PERIOD_S, 2.0 * CONTROL_PERIOD_S)
+    # The simulated drive applies the end value of its lags during the whole step, so that the hold of a step adds none.
+    dead = Range(0.0, 0.0, 0.5 * CONTROL_PERIOD_S)
     if two_mass and result.get("inertia_kg_m2") is None:
         return row | {"refused": f"identify: {result.get('reason') or result['error']['message']}"}
     try:

@@ -49,7 +49,7 @@ are rounded alike. Study of rounded and truncated responses of 2 to 100 counts w
 wrong verdict is beyond these limits."""
 LEAST_PAIRS = 8
 """Smallest number of pairs of steps. With fewer, their scatter is too uncertain."""
-SETTLED_LAGS, SETTLED_TIMES = 5.0, 2.0
+SETTLED_LAGS, SETTLED_TIMES = 3.0, 2.0
 """Length of a step: number of lags of the reported speed, plus number of predicted settling times."""
 
 _GOLDEN = 0.5 * (sqrt(5.0) - 1.0)

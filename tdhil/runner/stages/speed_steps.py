@@ -16,8 +16,8 @@ from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import MachineLimits
 from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, step_length_s
 
-PAIRS = 24
-"""Counted pairs of steps. Twice as many would narrow the intervals by a third."""
+PAIRS = 36
+"""Number of evaluated pairs of steps. Twice as many would narrow the intervals by a third."""
 TORQUE_SHARE = 0.45
 """Share of the torque between friction and limit that a step uses; noise and overshoot need the rest."""
 SPEED_SHARE = 0.25
