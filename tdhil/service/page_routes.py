@@ -112,7 +112,7 @@ class Pages:
         """Return a page in the language of the request. ``here``: the page's entry in the menu."""
         templates = self._templates[language_of(request, self._languages)]
         text = templates.get_template(template).render(
-            here=here, query=request.url.query, who=principal(request), login=self._site.access.login, **known)
+            here=here, who=principal(request), login=self._site.access.login, **known)
         return HTMLResponse(text, status, {"vary": "Accept-Language, Cookie"})
 
     def routes(self) -> list[BaseRoute]:

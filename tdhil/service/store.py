@@ -340,7 +340,7 @@ class Store:
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
-_VERSION: Final = 7
+_VERSION: Final = 6
 BATCH: Final = 100
 """Runs that are written to the index under its lock at a time: 5 to 20 ms, after their files were read without it."""
 
@@ -489,7 +489,6 @@ class Index:
                     columns = ", ".join((*_COLUMNS[1:], SEARCHED_COLUMN))
                     base.execute(f"create table runs (id text primary key, {columns})")
                     base.execute("create index by_rig on runs (rig, id)")
-                    base.execute("create index by_choice on runs (verdict, tags)")
                     base.execute(f"pragma user_version = {_VERSION}")
             found = self._path.stat()
             self._checked = found.st_dev, found.st_ino

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import itertools
 import random
-import re
 from dataclasses import asdict, replace
 
 import pytest
@@ -14,7 +12,6 @@ from tdhil.fleet import FleetRow
 from tdhil.service import site as site_module
 from tdhil.service.run_filter import SORTS, Order, RunFilter, Summary
 from tdhil.service.run_state import Status
-from tdhil.service.schemas import API
 from tdhil.service.store import Index, Store, StoredRequest, summary_of, write_json
 from tests.service.conftest import wait_for
 
@@ -151,14 +148,6 @@ def test_without_an_index_the_pages_come_from_the_files(call, service, monkeypat
                                    "archived=perhaps", f"tag={'x' * 201}"])
 def test_a_wrong_question_of_a_list_is_refused(call, query):
     call("GET", f"/runs/page?{query}", 422)
-
-
-@pytest.mark.parametrize("query", ["", "?text=bearing%203&page=2", "?tag=a%26b+c"])
-def test_the_page_of_a_list_requests_its_rows_before_its_scripts_run(client, query):
-    text = client.get(f"/runs{query}").text
-    found = re.search(r'<link rel="preload" as="fetch" crossorigin href="([^"]*)">', text)
-    assert html.unescape(found[1]) == f"{API}/runs/page{query}"
-    assert 'rel="preload"' not in client.get("/").text
 
 
 def test_the_plain_list_has_the_same_conditions(call, many):

@@ -388,7 +388,7 @@
       for (const one of heads) if (one.dataset.key === key) one.parentElement.setAttribute("aria-sort", way); else one.parentElement.removeAttribute("aria-sort");
     }
     async function look() {
-      const mine = ++asking, next = await call("GET", `/runs/page${location.search}`), now = JSON.stringify(next) + query;
+      const mine = ++asking, next = await call("GET", `/runs/page?${query}`), now = JSON.stringify(next) + query;
       if (mine !== asking || now === shown) return;          // a later request is on its way; or keep the keyboard focus
       shown = now;
       found = next;

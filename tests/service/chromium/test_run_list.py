@@ -83,19 +83,6 @@ def test_search_filters_and_order_reach_runs_of_every_page(page, many):
     page.locator("th[aria-sort=ascending]").wait_for()
 
 
-def test_a_page_seen_before_requests_only_itself_and_its_rows_and_these_at_once(page, many):
-    for _ in range(2):
-        page.goto("/runs?text=run%207")
-        page.locator("#runs a").first.wait_for()
-    found = page.evaluate("performance.getEntriesByType('resource').map((one) => one.toJSON())")
-    rows, *later = [one for one in found if "/runs/page" in one["name"]]
-    assert rows["name"].endswith("/api/v1/runs/page?text=run%207")
-    assert rows["initiatorType"] == "link"                      # the page's head, before any script
-    assert all(one["startTime"] - rows["startTime"] > 2900.0 for one in later)       # looks again every 3 s
-    files = [one for one in found if "/static/" in one["name"] or "/texts/" in one["name"]]
-    assert len(files) >= 10 and not any(one["transferSize"] for one in files)
-
-
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_list_with_its_filters_fits(page, many, width):
