@@ -16,8 +16,8 @@ from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import MachineLimits
 from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, step_length_s
 
-PAIRS = 36
-"""Number of evaluated pairs of steps. Twice as many would narrow the intervals by a third."""
+FEWEST_PAIRS, MOST_PAIRS, PAIRS_S = 24, 60, 160.0
+"""Number of evaluated pairs of steps, and their time, s. Fast loops have smaller steps and need more pairs."""
 TORQUE_SHARE = 0.45
 """Share of the torque between friction and limit that a step uses; noise and overshoot need the rest."""
 SPEED_SHARE = 0.25
@@ -57,7 +57,7 @@ def plan_steps(
                 "limits.torque_nm in rig.yaml", "Raise it within the machine's limits, or tune for a lower --bandwidth")
         step = counts * resolution_rad_s
     half_s = max(2, round(step_length_s(case) / period_s)) * period_s
-    pairs = min(PAIRS, int(left_s / (2.0 * half_s)) - 1)
+    pairs = min(max(FEWEST_PAIRS, min(MOST_PAIRS, int(PAIRS_S / (2.0 * half_s)))), int(left_s / (2.0 * half_s)) - 1)
     if pairs < LEAST_PAIRS:
         raise _refused(
             f"{LEAST_PAIRS} pairs of steps take {2.0 * half_s * (LEAST_PAIRS + 1):.0f} s, and the time limit leaves"
