@@ -67,6 +67,9 @@ BALANCE_STEPS = 4
 NOISE_BLOCK = 500
 """Number of ticks of bit noise that are drawn at once."""
 
+UNSTABLE_LOOPS_GROW = np.errstate(over="ignore", invalid="ignore")
+"""Decorator: signals of an unstable loop grow beyond the largest number, without a warning of numpy."""
+
 Array = NDArray[np.float64]
 Loop = tuple[TopDrive, SpeedController]
 Strings = DrillString | Sequence[DrillString]
@@ -298,6 +301,7 @@ class LoopSimulation:
         self.set_rad_s, self._target_rad_s = self.set_rad_s[loops], self._target_rad_s[loops]
 
 
+@UNSTABLE_LOOPS_GROW
 def simulate(
     strings: Strings,
     loops: Sequence[Loop],
