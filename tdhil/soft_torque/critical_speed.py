@@ -148,8 +148,10 @@ def ends_turning(
         running = running[goes_on]
         last = last_stuck[running]
         while simulation.ticks < end:
-            simulation.advance()
-            np.putmask(last, simulation.bit_rad_s == 0.0, simulation.ticks)
+            first = simulation.ticks + 1
+            stuck = simulation.advance_together(int(end) - simulation.ticks) == 0.0
+            ticks = np.arange(first, simulation.ticks + 1)[:, None, None]
+            last = np.maximum(last, np.max(np.where(stuck, ticks, 0), axis=0))
         np.putmask(last, ~np.isfinite(simulation.bit_rad_s), simulation.ticks)      # an unstable loop has no speed
         last_stuck[running] = last
     turned: NDArray[np.bool_] = last_stuck < (ends * (1.0 - calm_s / duration_s))[:, None]
