@@ -17,6 +17,7 @@ from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.simulation import (
     LONGEST_TICK_S,
     RPM,
+    UNSTABLE_LOOPS_GROW,
     Array,
     Begin,
     Loop,
@@ -121,6 +122,7 @@ def _first_of_the_rest(turns: NDArray[np.bool_]) -> int:
     return int(sticking[-1]) + 1 if sticking.size else 0
 
 
+@UNSTABLE_LOOPS_GROW
 def ends_turning(
     strings: Strings, loops: Sequence[Loop], how: Start | Sequence[Start], speeds_rpm: Array, search: Search,
     seeds: Sequence[int] | None = None,
@@ -146,8 +148,11 @@ def ends_turning(
         running = running[goes_on]
         last = last_stuck[running]
         while simulation.ticks < end:
-            simulation.advance()
-            np.putmask(last, simulation.bit_rad_s == 0.0, simulation.ticks)
+            first = simulation.ticks + 1
+            stuck = simulation.advance_together(int(end) - simulation.ticks) == 0.0
+            ticks = np.arange(first, simulation.ticks + 1)[:, None, None]
+            last = np.maximum(last, np.max(np.where(stuck, ticks, 0), axis=0))
+        np.putmask(last, ~np.isfinite(simulation.bit_rad_s), simulation.ticks)      # an unstable loop has no speed
         last_stuck[running] = last
     turned: NDArray[np.bool_] = last_stuck < (ends * (1.0 - calm_s / duration_s))[:, None]
     return turned

@@ -38,6 +38,7 @@ No torque limit is simulated.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -66,6 +67,9 @@ BALANCE_STEPS = 4
 """Number of Newton steps to the speed of a bit without inertia."""
 NOISE_BLOCK = 500
 """Number of ticks of bit noise that are drawn at once."""
+
+UNSTABLE_LOOPS_GROW = np.errstate(over="ignore", invalid="ignore")
+"""Decorator: signals of an unstable loop grow beyond the largest number, without a warning of numpy."""
 
 Array = NDArray[np.float64]
 Loop = tuple[TopDrive, SpeedController]
@@ -278,14 +282,28 @@ class LoopSimulation:
 
     def advance(self) -> Array:
         """Advance by one tick. Return the mean speed of every top over the tick."""
+        top_wave, mean_top = self._advance_top(self._pipe.at_top())
+        self._pipe.tick(top_wave, None if self._noise is None else self._noise.at(self.ticks - 1))
+        return mean_top
+
+    def advance_together(self, most: int) -> Array:
+        """Advance by up to ``most`` ticks: those in which no wave crosses a segment, so that all waves are known.
+
+        Return the speed of every bit after each tick, (ticks, loops, speeds).
+        """
+        waves = self._pipe.coming_to_top(most)
+        noise = None if self._noise is None else np.array([self._noise.at(self.ticks + k) for k in range(len(waves))])
+        bits = self._pipe.tick_together(np.array([self._advance_top(wave)[0] for wave in waves]), noise)
+        return bits.reshape(-1, *self.set_rad_s.shape)
+
+    def _advance_top(self, wave: Array) -> tuple[Array, Array]:
+        """Advance every top by one tick. Return (waves that go down, mean speeds)."""
         if self.ticks >= self._held_ticks and not self._arrived:
             self.set_rad_s = self.set_rad_s + np.clip(self._target_rad_s - self.set_rad_s, -self._ramp, self._ramp)
             self._arrived = bool(np.array_equal(self.set_rad_s, self._target_rad_s))
         other_nm = 0.0 if self._torque is None else self._torque.at(self.ticks * self.grid.tick_s)
-        top_wave, mean_top = self.top.step(self._pipe.at_top(), self.set_rad_s, other_nm)
-        self._pipe.tick(top_wave, None if self._noise is None else self._noise.at(self.ticks))
         self.ticks += 1
-        return mean_top
+        return self.top.step(wave, self.set_rad_s, other_nm)
 
     def keep(self, loops: NDArray[np.bool_]) -> None:
         """Go on with these loops only. Not for a torque on the rotors."""
@@ -298,6 +316,7 @@ class LoopSimulation:
         self.set_rad_s, self._target_rad_s = self.set_rad_s[loops], self._target_rad_s[loops]
 
 
+@UNSTABLE_LOOPS_GROW
 def simulate(
     strings: Strings,
     loops: Sequence[Loop],
@@ -384,7 +403,8 @@ class _Waves:
     def __init__(self, grids: Sequence[Grid], repeats: int) -> None:
         cases = len(grids) * repeats
         ticks = np.array(grids[0].ticks)
-        self._size = int(ticks.max())
+        self._shortest = int(ticks.min())
+        self._size = ceil(ticks.max() / self._shortest) * self._shortest
         self._count = count = len(ticks)
         self._sent = np.zeros((self._size, 2 * count, cases))
         # index, over all rows together, of the waves that arrive now
@@ -437,26 +457,37 @@ class _Waves:
         arriving: Array = self._every[self._arriving_at[self._now, self._count]]
         return arriving
 
-    def arriving(self) -> tuple[Array, Array]:
-        """Return the waves that leave every segment now: those at the lower ends and those at the upper ends."""
-        arriving = self._every.take(self._arriving_at[self._now], axis=0)
-        return arriving[: self._count], arriving[self._count :]
+    def coming_to_top(self, most: int) -> Array:
+        """Return the waves that leave the topmost segment at its upper end in the next ticks.
+
+        They are at most as many as the shortest segment has, and as the buffers have up to their end.
+        """
+        ticks = min(most, self._shortest, self._size - self._now)
+        coming: Array = self._every[self._arriving_at[self._now : self._now + ticks, self._count]]
+        return coming
+
+    def arriving(self, ticks: int) -> tuple[Array, Array]:
+        """Return the waves that leave every segment in each of the next ticks: at the lower ends, at the upper ends."""
+        arriving = self._every.take(self._arriving_at[self._now : self._now + ticks], axis=0)
+        return arriving[:, : self._count], arriving[:, self._count :]
 
     def send(self, down: Array, up: Array, from_top: Array, from_bit: Array) -> None:
-        """Pass the waves through every node, and advance by one tick."""
-        a, b = down[:-1], up[1:]
+        """Pass the waves of one or more ticks through every node, and advance by these ticks."""
+        a, b = down[:, :-1], up[:, 1:]
         driven = a + b
         if self._dry:
-            least = np.where(self._moving, self._kinetic, self._static)
-            self._moving = np.abs(driven) > least
-            driven = np.where(self._moving, driven - np.copysign(self._kinetic, driven), 0.0)
-        speed = driven * self._over
-        sent = self._sent[self._now]
-        sent[0] = from_top
-        sent[-1] = from_bit
-        np.subtract(self._twice_below * speed, b, out=sent[1 : self._count])
-        np.subtract(self._twice_above * speed, a, out=sent[self._count : -1])
-        self._now = (self._now + 1) % self._size
+            moving, size = np.empty(driven.shape, dtype=bool), np.abs(driven)
+            for tick, own in enumerate(size):
+                self._moving = np.greater(own, np.where(self._moving, self._kinetic, self._static), out=moving[tick])
+            driven -= np.copysign(self._kinetic, driven, out=size)
+            np.putmask(driven, ~moving, 0.0)
+        speed = np.multiply(driven, self._over, out=driven)
+        sent = self._sent[self._now : self._now + len(driven)]
+        sent[:, 0], sent[:, -1] = from_top, from_bit
+        down, up = sent[:, 1 : self._count], sent[:, self._count : -1]
+        np.subtract(np.multiply(self._twice_below, speed, out=down), b, out=down)
+        np.subtract(np.multiply(self._twice_above, speed, out=up), a, out=up)
+        self._now = (self._now + len(driven)) % self._size
 
 
 class PipeSimulation:
@@ -503,11 +534,24 @@ class PipeSimulation:
         """Return the string's torque τ just below the rotor at that speed, N·m."""
         return self._waves.top_torque(speed)
 
+    def coming_to_top(self, most: int) -> Array:
+        """Return the waves b of the next ticks, (ticks, cases): of those for which all waves are known."""
+        return self._waves.coming_to_top(most)
+
     def tick(self, from_top: Array, noise_nm: Array | None = None) -> None:
         """Advance by one tick, with the wave that the top sends down during it."""
-        arriving_down, arriving_up = self._waves.arriving()
-        bit_wave, self.bit_rad_s = self._bit.step(arriving_down[-1], self.bit_rad_s, noise_nm)
-        self._waves.send(arriving_down, arriving_up, from_top, bit_wave)
+        self.tick_together(from_top[None], None if noise_nm is None else noise_nm[None])
+
+    def tick_together(self, from_top: Array, noise_nm: Array | None = None) -> Array:
+        """Advance by some ticks, at most those of the shortest segment. Return each bit's speed after each tick.
+
+        All arrays are (ticks, cases).
+        """
+        arriving_down, arriving_up = self._waves.arriving(len(from_top))
+        bit_waves, bits = self._bit.steps(arriving_down[:, -1], self.bit_rad_s, noise_nm)
+        self._waves.send(arriving_down, arriving_up, from_top, bit_waves)
+        self.bit_rad_s = bits[-1]
+        return bits
 
 
 class _Top:
@@ -598,7 +642,7 @@ def _top_step(drive: TopDrive, controller: SpeedController, grid: Grid, most_lag
     return found
 
 
-class _Bit:
+class _Bit(ABC):
     """Friction of the bit and of the lower end of the string. Arrays have one value for each case."""
 
     def __init__(self, strings: Sequence[DrillString], grids: Sequence[Grid], repeats: int) -> None:
@@ -638,10 +682,25 @@ class _Bit:
         self._coulomb, self._falls = self._wall.copy(), np.zeros_like(self._falls)
         self.static_nm, self._bends, self._rests_harder = self._wall.copy(), False, False
 
+    @abstractmethod
+    def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
+        """Advance by one tick. Return (wave that goes up, speed after the tick)."""
+
+    def steps(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
+        """Advance by some ticks. Return (waves that go up, speeds), as (ticks, cases)."""
+        waves, speeds = np.empty((2, *arriving.shape))
+        for tick, wave in enumerate(arriving):
+            waves[tick], speed = self.step(wave, speed, None if noise_nm is None else noise_nm[tick])
+            speeds[tick] = speed
+        return waves, speeds
+
     def _bent(self, speed: Array) -> Array:
         if not self._bends:
             return np.zeros_like(speed)
-        over: Array = self._falls * np.exp(speed * speed * self._curve)
+        over: Array = speed * speed
+        over *= self._curve
+        np.exp(over, out=over)
+        over *= self._falls
         return over
 
 
@@ -709,25 +768,45 @@ class _LightBit(_Bit):
             end = np.where(self._falls > 0.0, end, 0.0) * np.where(self._falls > 0.0, self._width, 1.0)
             ends.append(self._viscous * end + self._coulomb + self._bent(end))
         self._slow_below, self._fast_above = ends
+        self._surely_fast, self._surely_slow = np.maximum(*ends), np.minimum(*ends)
         self._flattest = 1e-3 * self._viscous
         self._steepest_at = self._width / sqrt(2.0)
 
     def step(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
         """Advance by one tick. Return (wave that goes up, speed in this tick)."""
         driven = arriving if noise_nm is None else arriving - noise_nm
+        was_fast = speed * np.sign(driven) > self._steepest_at
+        end = self._balanced(driven, np.abs(driven) > np.where(was_fast, self._fast_above, self._slow_below))
+        if self._rests_harder:
+            end = np.where((speed * driven <= 0.0) & (np.abs(driven) <= self.static_nm), 0.0, end)
+        return 2.0 * self._impedance * end - arriving, end
+
+    def steps(self, arriving: Array, speed: Array, noise_nm: Array | None = None) -> tuple[Array, Array]:
+        """Advance by some ticks: at once, unless the balance depends on the speed in the tick before."""
+        driven = arriving if noise_nm is None else arriving - noise_nm
+        torque = np.abs(driven)
+        fast = torque > self._surely_fast
+        if self._rests_harder or (self._bends and np.any(~fast & (torque > self._surely_slow))):
+            return super().steps(arriving, speed, noise_nm)
+        end = self._balanced(driven, fast)
+        return 2.0 * self._impedance * end - arriving, end
+
+    def _balanced(self, driven: Array, fast: NDArray[np.bool_]) -> Array:
+        """Return the speed in balance. ``fast``: on the fast branch."""
         torque = np.abs(driven)
         rests = torque <= self._coulomb + self._falls
         found = (torque - self._coulomb) / self._viscous
         if self._bends:
-            was_fast = speed * np.sign(driven) > self._steepest_at
-            fast = torque > np.where(was_fast, self._fast_above, self._slow_below)
             rests &= ~fast
             found -= np.where(fast, 0.0, self._falls / self._viscous)
             for _ in range(BALANCE_STEPS):
                 bent = self._bent(found)
-                over = self._viscous * found + self._coulomb + bent - torque
-                found = found - over / np.maximum(self._viscous - self._steeper * found * bent, self._flattest)
-        if self._rests_harder:
-            rests |= (speed * driven <= 0.0) & (torque <= self.static_nm)
-        end = np.where(rests, 0.0, np.copysign(found, driven))
-        return 2.0 * self._impedance * end - arriving, end
+                over = self._viscous * found
+                over += self._coulomb
+                over += bent
+                over -= torque
+                bent *= self._steeper * found
+                np.subtract(self._viscous, bent, out=bent)
+                over /= np.maximum(bent, self._flattest, out=bent)
+                found -= over
+        return np.where(rests, 0.0, np.copysign(found, driven))

@@ -27,22 +27,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from math import inf, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.soft_torque.controller import (
-    SpeedController,
-    TopDrive,
-    control_law,
-    impedance,
-    inner_lags,
-)
+from tdhil.soft_torque.controller import SpeedController, TopDrive, control_law, impedance, inner_lags
 from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
 
 Reals = NDArray[np.float64]
+Points = NDArray[np.int64]
+"""Numbers of points of a grid of frequencies."""
 
 LOWEST_RAD_S = 1e-3
 STEPS_PER_MODE = 60
@@ -50,6 +46,10 @@ STEPS_PER_MODE = 60
 STEPS_PER_WIDTH = 3
 """Number of frequencies within the half-width of a resonance, d/(2 m) rad/s."""
 MOST_FREQUENCIES = 30_000
+LOW_FREQUENCIES = 60
+"""Number of frequencies below the even part of the grid."""
+COARSER, LEAST_COARSE = 8, 200
+"""Ratio of the steps of two successive grids, and least number of steps of the coarsest one."""
 REFINEMENT, NEAR = 24, 1.5
 """Steps into which a step of the grid is divided, and the range |ln |L|| in which this is done."""
 LEAST_GAIN = 0.2
@@ -110,25 +110,34 @@ def least_of(every: Sequence[LoopMargins]) -> LoopMargins:
         for name in ("phase_deg", "gain_db", "dead_time_s", "lag_s", "modulus")))
 
 
-@dataclass(frozen=True)
 class StringResponse:
-    """Impedance Z_s of one string over a grid of frequencies, for a turning bit and for a stuck bit."""
+    """Speed and torque at the top of one string over a grid of frequencies. Each is computed once, if it is needed."""
 
-    string: DrillString
-    omega_rad_s: Reals
-    turning: Complex
+    def __init__(self, string: DrillString, omega_rad_s: Reals) -> None:
+        self.string, self.omega_rad_s = string, omega_rad_s
+        even = omega_rad_s[LOW_FREQUENCIES:]
+        step = float(even[1] - even[0]) if even.size > 1 else inf
+        coarsest = min(2.0 * pi / string.echo_s / STEPS_PER_MODE, step * even.size / LEAST_COARSE)
+        self.coarsest = COARSER ** max(0, int(log(coarsest / step, COARSER)))
+        """Step of the coarsest grid, in steps of the whole one."""
+        self._known: dict[bool, tuple[Complex, Complex, NDArray[np.bool_]]] = {}
 
-    @cached_property
-    def stuck(self) -> Complex:
-        """Return Z_s for a stuck bit. A test for stability alone does not need it."""
-        return self.string.impedance_at(np.asarray(1j * self.omega_rad_s, dtype=np.complex128), stuck=True)
+    def at_top(self, points: Points, *, stuck: bool) -> tuple[Complex, Complex]:
+        """Return (speed, torque) at the top, up to a common factor, at these points of the grid."""
+        if stuck not in self._known:
+            speed, torque = np.empty((2, self.omega_rad_s.size), dtype=np.complex128)
+            self._known[stuck] = speed, torque, np.zeros(speed.size, dtype=bool)
+        speed, torque, known = self._known[stuck]
+        new = points[~known[points]]
+        if new.size:
+            speed[new], torque[new] = self.string.at_top(np.asarray(1j * self.omega_rad_s[new]), stuck=stuck)
+            known[new] = True
+        return speed[points], torque[points]
 
 
 def response_of(string: DrillString, highest_rad_s: float) -> StringResponse:
-    """Return Z_s on a grid that resolves every resonance of the string up to ``highest_rad_s``."""
-    omega = _grid(string, highest_rad_s)
-    s: Complex = np.asarray(1j * omega, dtype=np.complex128)
-    return StringResponse(string, omega, string.impedance_at(s))
+    """Return the response on a grid that resolves every resonance of the string up to ``highest_rad_s``."""
+    return StringResponse(string, _grid(string, highest_rad_s))
 
 
 def _grid(string: DrillString, highest_rad_s: float) -> Reals:
@@ -138,10 +147,11 @@ def _grid(string: DrillString, highest_rad_s: float) -> Reals:
     if min(widths) > 0.0:
         step = min(step, min(widths) / STEPS_PER_WIDTH)
     step = max(step, highest_rad_s / MOST_FREQUENCIES)
-    low = np.geomspace(LOWEST_RAD_S, 10.0 * step, 60, endpoint=False)
+    low = np.geomspace(LOWEST_RAD_S, 10.0 * step, LOW_FREQUENCIES, endpoint=False)
     return np.concatenate([low, np.arange(10.0 * step, highest_rad_s, step)])
 
 
+@lru_cache(maxsize=1024)
 def highest_crossover(drive: TopDrive, law: SpeedController) -> float:
     """Return the frequency, rad/s, above which |L| of the bare drive stays below half of `LEAST_GAIN`.
 
@@ -182,39 +192,129 @@ def loop_margins(
     top = highest_crossover(drive, law)
     if response is None or response.omega_rad_s[-1] < 0.98 * top:
         response = response_of(string, top)
-    omega = response.omega_rad_s
-    s: Complex = np.asarray(1j * omega, dtype=np.complex128)
-    through = inner_lags(drive, s) * control_law(law, s)
-    rotor = drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad
     least = [inf, inf, inf, inf, inf]
     stable = True
     for is_stuck in (False, True) if stuck else (False,):
-        loop = through / (rotor + (response.stuck if is_stuck else response.turning))
+        points, fine = _deciding_points(drive, law, response, is_stuck, exact)
+        omega = response.omega_rad_s[points]
+        speed, torque = response.at_top(points, stuck=is_stuck)
+        loop = _open_loop(drive, law, omega, torque / speed)
         # Nyquist criterion: rotor and string are passive, so L has no pole in the right half-plane, and the loop is
         # stable if L does not encircle −1. The phase of 1 + L begins between −180° and 0, because L has at most one
         # pole at the origin that is not balanced by losses. It ends at 0 if −1 is not encircled, otherwise at a
         # multiple of 360°.
         stable = stable and abs(float(np.unwrap(np.angle(1.0 + loop))[-1])) < 0.5 * pi
-        found = _crossings(omega, loop)
         if exact:
-            near = _refined(omega, np.log(np.abs(loop)))
-            fine: Complex = np.asarray(1j * near, dtype=np.complex128)
-            own = inner_lags(drive, fine) * control_law(law, fine) / (
-                drive.inertia_kg_m2 * fine + drive.viscous_nm_s_rad + string.impedance_at(fine, stuck=is_stuck))
-            found = _crossings(near, own)
-        least = [min(pair) for pair in zip(least, found, strict=True)]
+            omega = _refined(omega, np.log(np.abs(loop)), np.searchsorted(points, fine))
+            loop = _open_loop(drive, law, omega, string.impedance_at(np.asarray(1j * omega), stuck=is_stuck))
+        least = [min(pair) for pair in zip(least, _crossings(omega, loop), strict=True)]
     if not stable:
         return LoopMargins(False, 0.0, 0.0, 0.0, 0.0, least[4])
     return LoopMargins(True, *least)
 
 
-def _refined(omega: Reals, size: Reals) -> Reals:
-    """Return the grid with each step divided into `REFINEMENT` steps wherever |ln |L|| is below `NEAR`."""
-    near = np.flatnonzero(np.minimum(np.abs(size[:-1]), np.abs(size[1:])) < NEAR)
+def _open_loop(drive: TopDrive, law: SpeedController, omega: Reals, impedance_nm_s_rad: Complex) -> Complex:
+    """Return L with this impedance of the string."""
+    s: Complex = np.asarray(1j * omega, dtype=np.complex128)
+    rotor = drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad
+    loop: Complex = inner_lags(drive, s) * control_law(law, s) / (rotor + impedance_nm_s_rad)
+    return loop
+
+
+def _refined(omega: Reals, size: Reals, steps: Points) -> Reals:
+    """Return the grid with each of these steps divided into `REFINEMENT` steps if |ln |L|| is below `NEAR` there."""
+    near = steps[np.minimum(np.abs(size[steps]), np.abs(size[steps + 1])) < NEAR]
     parts = np.arange(1, REFINEMENT) / REFINEMENT
     between = omega[near, None] + (omega[near + 1] - omega[near])[:, None] * parts
     merged: Reals = np.sort(np.concatenate([omega, between.ravel()]))
     return merged
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Points that decide. Resonances of a lightly damped string are sharp in L, and need a fine grid. But L = N/D, and
+# N = s H law ω and D = s ((J s + B) ω + τ) are as smooth as speed ω and torque τ at the top of the string: entire
+# functions, which change over the spacing of the modes. So a coarse grid shows between which of its points N and D can
+# make a crossing, a turn of the phase or the least distance from −1. Only these steps are refined.
+
+
+def _deciding_points(
+    drive: TopDrive, law: SpeedController, response: StringResponse, stuck: bool, exact: bool
+) -> tuple[Points, Points]:
+    """Return the points of the grid that may decide a margin, with a coarse grid between them.
+
+    The second array is the points before the steps that may decide, if they are asked for with ``exact``.
+    """
+    omega, step = response.omega_rad_s, response.coarsest
+    rows = np.arange(LOW_FREQUENCIES, omega.size, step)[None, :]
+    taken, fine = np.zeros((2, omega.size), dtype=bool)
+    for ends in (slice(0, LOW_FREQUENCIES), slice(rows[0, -1], None)):      # outside the coarsest grid
+        taken[ends] = fine[ends] = True
+    taken[rows] = True
+    nearest = inf
+    while step > 1 or exact:
+        s: Complex = np.asarray(1j * omega[rows], dtype=np.complex128)
+        speed, torque = response.at_top(rows, stuck=stuck)
+        over = s * inner_lags(drive, s) * control_law(law, s) * speed
+        under = s * ((drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad) * speed + torque)
+        nearest = min(nearest, float(np.min(np.abs(1.0 + over / under), initial=inf)))
+        steps = rows[:, :-1][_may_decide(over, under, nearest)]
+        if step == 1:
+            fine[steps] = True
+            break
+        step //= COARSER
+        rows = steps[:, None] + step * np.arange(COARSER + 1)
+        taken[rows] = True
+    return np.flatnonzero(taken), np.flatnonzero(fine[:-1])
+
+
+def _may_decide(over: Complex, under: Complex, nearest: float) -> NDArray[np.bool_]:
+    """Return for each step of each row whether L = N/D may cross, turn, or come nearer to −1 than ``nearest``.
+
+    Between two points, N and D are straight lines, to within their bend. |N|² − |D|², Im N D* and Re N D* + |D|² are
+    then parabolas, and their range is exact.
+    """
+    n0, n1, d0, d1 = over[:, :-1], over[:, 1:], under[:, :-1], under[:, 1:]
+    dn, dd, bend_n, bend_d = n1 - n0, d1 - d0, _bend(over), _bend(under)
+    size_n, size_d = (np.maximum(np.abs(a), np.abs(b)) for a, b in ((n0, n1), (d0, d1)))
+    square_n, square_d = ((2.0 * size + bend) * bend for size, bend in ((size_n, bend_n), (size_d, bend_d)))
+    product = size_n * bend_d + size_d * bend_n + bend_n * bend_d
+    cross = n0 * d0.conj(), n1 * d1.conj(), dn * dd.conj()
+    of_n, of_d = ([np.abs(one) ** 2 for one in three] for three in ((n0, n1, dn), (d0, d1, dd)))
+    found = _holds_zero([a - b for a, b in zip(of_n, of_d, strict=True)], square_n + square_d)
+    found |= _holds_zero([one.real + own for one, own in zip(cross, of_d, strict=True)], product + square_d)
+    negative = _range([one.real for one in cross])[0] <= product
+    found |= _holds_zero([one.imag for one in cross], product) & negative
+    # the phase of D or of D + N may turn by more than 30°
+    sum0, bend = n0 + d0, bend_n + bend_d
+    found |= (np.abs(dn + dd) + bend > 0.5 * np.abs(sum0)) | (np.abs(dd) + bend_d > 0.5 * np.abs(d0))
+    # 1 + L runs along an arc, which is flat if D turns little
+    ratio = (over + under) / under
+    away, size = np.abs(ratio), np.minimum(np.abs(d0), np.abs(d1))
+    least, most = np.minimum(away[:, :-1], away[:, 1:]), np.maximum(away[:, :-1], away[:, 1:])
+    found |= least - np.abs(ratio[:, 1:] - ratio[:, :-1]) - 2.0 * (bend + most * bend_d) / size < nearest
+    return found
+
+
+def _bend(values: Complex) -> Reals:
+    """Return twice the largest distance of each step of each row from a straight line, by the second differences."""
+    second = np.abs(values[:, :-2] - 2.0 * values[:, 1:-1] + values[:, 2:])
+    wide = np.concatenate([second[:, :1], second, second[:, -1:]], axis=1)
+    bend: Reals = 0.25 * np.maximum(wide[:, :-1], wide[:, 1:])
+    return bend
+
+
+def _holds_zero(three: Sequence[Reals], slack: Reals) -> NDArray[np.bool_]:
+    low, high = _range(three)
+    return (low <= slack) & (high >= -slack)
+
+
+def _range(three: Sequence[Reals]) -> tuple[Reals, Reals]:
+    """Return the range of a parabola over a step, from its values at both ends and its quadratic coefficient."""
+    first, last, square = three
+    slope = last - first - square
+    inside = (slope * square < 0.0) & (np.abs(slope) < 2.0 * np.abs(square))
+    vertex = np.where(inside, first - 0.25 * slope**2 / np.where(inside, square, 1.0), first)
+    return np.minimum(np.minimum(first, last), vertex), np.maximum(np.maximum(first, last), vertex)
 
 
 def is_stable(
@@ -320,15 +420,11 @@ def linear_limit_rad_s(bit: BitFriction, slope_nm_s_rad: float) -> float:
         return 0.0
     wanted = slope_nm_s_rad * width / (2.0 * falls)
 
-    def excess(x: float) -> float:
-        return log(x) - x * x - log(max(wanted, 1e-300))
-
-    low, high = 1.0 / sqrt(2.0), 30.0
-    if excess(low) <= 0.0:
+    size, low, high = log(max(wanted, 1e-300)), 1.0 / sqrt(2.0), 30.0
+    if log(low) - low * low - size <= 0.0:
         return 0.0
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
+    while low < (middle := 0.5 * (low + high)) < high:      # to the last digit
+        low, high = (middle, high) if log(middle) - middle * middle - size > 0.0 else (low, middle)
     return low * width
 
 

@@ -6,6 +6,7 @@ import argparse
 import io
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +90,21 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     assert "25.02 Speed proportional gain" in words
     assert "--rated-torque" in words
     assert "Feed-forward of the setpoint's acceleration does not replace it." in words
+
+
+@pytest.mark.heavy
+def test_the_card_names_unstable_present_gains_and_no_warning_of_numpy_is_shown(tmp_path, capsys):
+    """The signals of the present loop grow beyond the largest number. stderr has lines of progress only."""
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result(inertia_kg_m2=estimate(1.0, 0.96, 1.04))), encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        code = main(["tune", "soft-torque", str(path), "--string", str(STRING_YAML), "--present", "400000", "30000",
+                     "--inner-lags", "20ms", "10ms", "3ms"])
+    out, err = capsys.readouterr()
+    assert code == 0 and "present: thin margins, unstable" in out
+    assert "above 240 →" in " ".join(out.split())
+    assert all(line.startswith("tune: ") for line in err.splitlines()), err
 
 
 @pytest.mark.parametrize(("words", "said", "code", "message"), [

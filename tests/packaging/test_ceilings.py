@@ -24,7 +24,7 @@ CEILINGS = {
     "tdhil/runner": (12_000, FIRST),
     "tdhil/service": (11_900, FIRST),
     "tdhil/session": (4_500, FIRST),
-    "tdhil/soft_torque": (5_900, FIRST),
+    "tdhil/soft_torque": (6_100, "0087"),
     "tdhil/speed_loop": (1_500, FIRST),
     "tdhil/studies": (6_100, FIRST),
     "drivers": (12_700, FIRST),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from math import inf
 
@@ -17,6 +18,7 @@ from tdhil.soft_torque import (
     PipeSection,
     RequiredMargins,
     Search,
+    SpeedController,
     StringFile,
     TopDrive,
     TuneCase,
@@ -126,6 +128,32 @@ def test_gains_with_thin_margins_are_not_green():
     assert any(words.startswith("phase margin") for words in present.failed)
     with pytest.raises(TuningRefused, match=r"too little margin: phase margin \d+° \(limit 30°\)"):
         tune(TuneCase(STRING, DRIVE, J, softness=1.6), search=None)
+
+
+WILD = SpeedController(400_000.0, 30_000.0)
+"""Gains with which the loop is so unstable that its signals grow beyond the largest number."""
+
+
+@pytest.mark.parametrize("how", ["stuck", "rest"])
+def test_a_loop_that_grows_without_limit_never_turns_the_bit(how):
+    """A bit without a finite speed does not turn, at any set speed, and numpy does not warn of it."""
+    light = replace(DRIVE, inertia_kg_m2=100.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert lowest_turning_with_noise([STRING], [(light, WILD)], [1], how, 2.0).tolist() == [inf]
+
+
+@pytest.mark.heavy
+def test_unstable_present_gains_are_not_kept():
+    """Any row that keeps the margins is better than unstable gains. No warning of numpy is shown."""
+    light, inertia = replace(DRIVE, inertia_kg_m2=100.0), Interval(100.0, 96.0, 104.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tuning = tune(TuneCase(STRING, light, inertia, present=WILD, draws=3))
+    present = tuning.by_kind("present")
+    assert present.failed == ("unstable",) and not present.with_string.stable
+    assert present.cure.median is None and present.quiet_cure_rpm is None
+    assert tuning.advice.kind == "soft" and not tuning.advice.keep
 
 
 @pytest.mark.heavy

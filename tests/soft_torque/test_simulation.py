@@ -280,6 +280,40 @@ def test_loops_with_different_starts_and_ends_are_simulated_together_as_each_alo
     assert simulation.ticks == max(ticks) and len(set(ticks)) == 4
 
 
+def rubbing(string, lines):
+    """Return the string with dry friction on its first lines, as many as ``lines``."""
+    dry = [replace(line, coulomb_nm_m=0.4, static_nm_m=0.6) for line in string.lines[:lines]]
+    return replace(string, lines=(*dry, *string.lines[lines:]))
+
+
+@pytest.mark.parametrize(("outer_m", "lines", "at_once"), [(None, 0, False), (None, 1, False), (0.203, 0, True),
+                                                           (0.203, 1, True), (0.203, 2, False), (0.127, 0, False)])
+def test_ticks_that_are_simulated_together_are_those_of_one_by_one(outer_m, lines, at_once, monkeypatch):
+    """Heavy and light bits, walls that rub, a bit that jumps: equal to the last digit. A light bit's balance is found
+    at once for all ticks, unless it depends on the tick before.
+    """
+    string = rubbing(STRING if outer_m is None else above_collars(1500.0, 180.0, outer_m), lines)
+    loops, speeds = [(DRIVE, SOFT_025), (DRIVE, STIFF)], np.array([[20.0, 60.0, 110.0], [30.0, 90.0, 150.0]]) * RPM
+    single = []
+    step = _LightBit.step
+    monkeypatch.setattr(_LightBit, "step", lambda self, *a: single.append(1) or step(self, *a))
+
+    def simulation():
+        return LoopSimulation(string, loops, Begin(["stuck", "rest"], speeds), speeds, 2.0, 0.012, disturbance=[1, 2])
+
+    together, each = simulation(), simulation()
+    found: list = []
+    while together.ticks < 2001:
+        found += list(together.advance_together(2001 - together.ticks))
+    assert together.ticks == len(found) == 2001 and (not single) == (at_once or outer_m is None)
+    bits = []
+    for _ in range(2001):
+        each.advance()
+        bits.append(each.bit_rad_s)
+    assert np.array_equal(found, bits) and np.array_equal(together.top.torque_nm, each.top.torque_nm)
+    assert 0.02 < np.mean(np.array(bits) == 0.0) < 0.98
+
+
 def test_gains_whose_stick_slip_may_be_too_slow_are_told():
     """Beyond eight periods of the string, the critical speeds may be too low: present gains without integral action."""
     shown = {}

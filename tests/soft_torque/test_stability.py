@@ -9,18 +9,35 @@ import pytest
 
 from tdhil.soft_torque import (
     RPM,
+    BottomEnd,
     ClosedSystem,
     DrillString,
+    LoopMargins,
+    PipeSection,
     RootsLost,
     SpeedController,
+    StringFile,
     TopDrive,
     is_stable,
     linear_limit,
     loop_margins,
+    string_of,
 )
+from tdhil.soft_torque.controller import control_law, inner_lags
 from tdhil.soft_torque.roots import count_right_of
-from tdhil.soft_torque.stability import highest_crossover, response_of
-from tests.soft_torque.cases import DRIVE, HALF, STIFF, STRING, TABLE, Pipe, lumped_chain, string_with
+from tdhil.soft_torque.stability import NEAR, REFINEMENT, _crossings, highest_crossover, response_of
+from tests.soft_torque.cases import (
+    BIT,
+    DRIVE,
+    HALF,
+    SOFT_035,
+    STIFF,
+    STRING,
+    TABLE,
+    Pipe,
+    lumped_chain,
+    string_with,
+)
 
 
 def unstable_with(string, drive, law, dead_time_s, *, stuck=False):
@@ -149,14 +166,119 @@ def test_unstable_loops_have_no_margin():
 def test_whether_a_loop_is_stable_needs_no_response_with_a_stuck_bit(monkeypatch):
     """The response of a stuck bit is computed once, and only if its margins are asked for."""
     asked = []
-    original = DrillString.impedance_at
+    original = DrillString.at_top
 
     def counted(self, s, *, stuck=False):
         asked.append(stuck)
         return original(self, s, stuck=stuck)
 
-    monkeypatch.setattr(DrillString, "impedance_at", counted)
+    monkeypatch.setattr(DrillString, "at_top", counted)
     assert is_stable(STRING, DRIVE, HALF) and asked == [False]
     response = response_of(STRING, highest_crossover(DRIVE, HALF))
     assert loop_margins(DRIVE, HALF, STRING, response) == loop_margins(DRIVE, HALF, STRING, response)
     assert asked == [False, False, True]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The grid is refined only where a margin may be decided. The result is that of the whole grid, to the last digit.
+
+COLLARS = string_of(StringFile(
+    sections=(PipeSection(length_m=1800.0, outer_diameter_m=0.127, inner_diameter_m=0.1086, side_force_n_m=60.0),),
+    bottom=BottomEnd(sections=(PipeSection(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714),), **BIT)))
+
+
+def on_the_whole_grid(drive, law, string, *, exact=False):
+    """Return the margins from every point of the grid, and with ``exact`` from every step near |L| = 1 divided."""
+    omega = response_of(string, highest_crossover(drive, law)).omega_rad_s
+
+    def loop(omega, stuck):
+        s = 1j * omega
+        rotor = drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad
+        return inner_lags(drive, s) * control_law(law, s) / (rotor + string.impedance_at(s, stuck=stuck))
+
+    found, stable = [], True
+    for stuck in (False, True):
+        at, seen = omega, loop(omega, stuck)
+        stable &= abs(np.unwrap(np.angle(1.0 + seen))[-1]) < 0.5 * np.pi
+        if exact:
+            size = np.abs(np.log(np.abs(seen)))
+            near = np.flatnonzero(np.minimum(size[:-1], size[1:]) < NEAR)
+            parts = np.arange(1, REFINEMENT) / REFINEMENT
+            between = omega[near, None] + (omega[near + 1] - omega[near])[:, None] * parts
+            at = np.sort(np.concatenate([omega, between.ravel()]))
+            seen = loop(at, stuck)
+        found.append(_crossings(at, seen))
+    least = [min(pair) for pair in zip(*found, strict=True)]
+    return LoopMargins(True, *least) if stable else LoopMargins(False, 0.0, 0.0, 0.0, 0.0, least[4])
+
+
+def any_string(random):
+    """Return one to three sections of pipe, each of 30 to 4,000 m, with any drag, above collars or one inertia."""
+    def section(length_m, outer_m, inner_m, drag):
+        return PipeSection(length_m=length_m, outer_diameter_m=outer_m, inner_diameter_m=inner_m, drag_nm_s_rad_m=drag)
+
+    sections = []
+    for _ in range(random.integers(1, 4)):
+        outer_m = random.uniform(0.09, 0.25)
+        sections.append(section(np.exp(random.uniform(np.log(30.0), np.log(4000.0))), outer_m,
+                                outer_m * random.uniform(0.2, 0.9), np.exp(random.uniform(np.log(1e-5), np.log(0.03)))))
+    viscous = random.uniform(0.0, 50.0)
+    if random.random() < 0.5:
+        bottom = {"inertia_kg_m2": np.exp(random.uniform(0.0, np.log(1000.0)))}
+    else:
+        drag = np.exp(random.uniform(np.log(1e-4), np.log(0.01)))
+        bottom = {"sections": (section(random.uniform(20.0, 300.0), 0.203, 0.0714, drag),)}
+    return string_of(StringFile(sections=tuple(sections), bottom=BottomEnd(viscous_nm_s_rad=viscous, **bottom)))
+
+
+def any_loop(random):
+    """Return (drive, law, string), stable or not, with P from a third to a hundred times the string's impedance."""
+    string, inertia = any_string(random), float(np.exp(random.uniform(np.log(50.0), np.log(5000.0))))
+    lags = tuple(np.exp(random.uniform(np.log(0.001), np.log(0.1), random.integers(0, 4))).tolist())
+    share = float(random.choice([0.0, 0.0, random.uniform(0.05, 0.8)]))
+    omega = float(random.choice([0.0, 1.0, 1.0, 1.0])) * 2.0 * np.pi * 0.39 / string.echo_s * random.uniform(0.2, 2.0)
+    gain = string.impedance_nm_s_rad / np.exp(random.uniform(np.log(0.01), np.log(3.0)))
+    law = SpeedController(gain, omega**2 * inertia * (1.0 - share), share * inertia)
+    return TopDrive(inertia, float(random.uniform(0.0, 20.0)), 0.0, lags), law, string
+
+
+def check_grid(count, seed, *, exact=False):
+    random = np.random.default_rng(seed)
+    coarse = 0
+    for loop in (any_loop(random) for _ in range(count)):
+        assert loop_margins(*loop, exact=exact) == on_the_whole_grid(*loop, exact=exact), loop
+        coarse += response_of(loop[2], highest_crossover(*loop[:2])).coarsest > 1
+    assert coarse > count / 2
+
+
+@pytest.mark.parametrize(("count", "exact"), [(16, False), pytest.param(60, False, marks=pytest.mark.heavy),
+                                              pytest.param(3, True, marks=pytest.mark.heavy)])
+def test_no_crossing_is_missed_between_the_points_of_the_coarse_grid(count, exact):
+    """Lightly damped strings, sharp resonances, soft and stiff, stable and unstable: all margins are the same."""
+    check_grid(count, 3, exact=exact)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "exact"), [(3000, False), (100, True)])
+def test_no_crossing_is_missed_on_many_loops(count, exact):
+    """The same on many loops."""
+    check_grid(count, 4, exact=exact)
+
+
+@pytest.mark.parametrize("law", [STIFF, SOFT_035])
+def test_few_points_of_a_fine_grid_are_computed(law, monkeypatch):
+    """Pipe above collars has a grid of 8,840 to 30,000 frequencies. The margins need less than a fifth of them."""
+    computed = []
+    original = DrillString.at_top
+
+    def counted(self, s, *, stuck=False):
+        computed.append(np.size(s))
+        return original(self, s, stuck=stuck)
+
+    monkeypatch.setattr(DrillString, "at_top", counted)
+    response = response_of(COLLARS, highest_crossover(DRIVE, law))
+    assert response.omega_rad_s.size > 8_000
+    first = loop_margins(DRIVE, law, COLLARS, response)
+    assert sum(computed) < 0.2 * 2 * response.omega_rad_s.size
+    before = len(computed)
+    assert loop_margins(DRIVE, law, COLLARS, response) == first and len(computed) == before
