@@ -24,6 +24,7 @@ from tdhil.report.blocks import (
     report_of_run,
     shown_date,
 )
+from tdhil.report.card import rounded
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import marks, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
@@ -66,7 +67,7 @@ def verification_document(
         "verdict": found.outcome.value,
         "reason": found.reason,
         "next_step": _NEXT[found.outcome.value],
-        "confidence": 0.95,
+        "confidence": found.confidence,
         "rows": [{"name": row.name, "measured": asdict(row.measured), "predicted": asdict(row.predicted),
                   "within": row.within} for row in found.rows],
         "tuned_for": {"kind": case.kind, "source": case.source},
@@ -97,7 +98,8 @@ def print_verification(document: Part, console: PlainConsole) -> None:
         for name, measured, predicted, said in _table(document):
             grid.add_row(name, measured, predicted, Words(said, style="bold red" if said == "differs" else ""))
         console.print(grid)
-        console.print(Words("The measured intervals have a joint coverage of 95 %.", style="dim"))
+        percent = 100.0 * document["confidence"]
+        console.print(Words(f"The measured intervals have a joint coverage of {percent:g} %.", style="dim"))
 
 
 def _rows(document: Part) -> Iterator[tuple[str, str]]:
@@ -124,12 +126,10 @@ def _table(document: Part) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _ends(part: Part, times: float) -> str:
-    value, low, high = (part[name] for name in ("value", "low", "high"))
+    value, low, high = (None if part[name] is None else times * part[name] for name in ("value", "low", "high"))
     if value is None:
         return "–"
-    if low == high:
-        return f"{times * value:.4g}"
-    return f"{times * value:.3g} ({times * low:.3g}–{'∞' if high is None else f'{times * high:.3g}'})"
+    return f"{value:.4g}" if low == high else "{} ({}–{})".format(*rounded(value, low, high))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -208,6 +208,8 @@ class StepVerification:
     reported: Reals
     fitted: Reals
     predicted: Reals
+    confidence: float = CONFIDENCE
+    """Joint coverage of the measured intervals."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
