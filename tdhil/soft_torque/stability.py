@@ -242,7 +242,7 @@ def _deciding_points(
 ) -> tuple[Points, Points]:
     """Return the points of the grid that may decide a margin, with a coarse grid between them.
 
-    The second array is the points before the steps that may decide, if they are asked for with ``exact``.
+    The second array has the points before the steps that may decide. Only ``exact`` margins need it.
     """
     omega, step = response.omega_rad_s, response.coarsest
     rows = np.arange(LOW_FREQUENCIES, omega.size, step)[None, :]
