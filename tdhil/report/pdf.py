@@ -90,8 +90,8 @@ _MOST_EMPTY = (0.25 * (BOTTOM - TOP), 0.0)
 """Spaces that are tried: the largest that a table leaves empty on a sheet so that it stays in one piece, points."""
 _SHORTER = (38.0, 76.0, 113.0, 150.0, 188.0)
 """Lengths by which the sheet before the last is tried shorter, points."""
-_LEAST_FILLED = 0.5
-"""Share of the last sheet that is filled at least, if any layout allows it.
+_LEAST_FILLED = 0.53
+"""Share of the last sheet's text area that is filled at least, if any layout allows it: half of the sheet.
 
 A report of little more than one sheet cannot fill a second one: the first would be left emptier than `_MOST_LEFT`.
 """
