@@ -801,12 +801,6 @@ class _LightBit(_Bit):
             found -= np.where(fast, 0.0, self._falls / self._viscous)
             for _ in range(BALANCE_STEPS):
                 bent = self._bent(found)
-                over = self._viscous * found
-                over += self._coulomb
-                over += bent
-                over -= torque
-                bent *= self._steeper * found
-                np.subtract(self._viscous, bent, out=bent)
-                over /= np.maximum(bent, self._flattest, out=bent)
-                found -= over
+                over = self._viscous * found + self._coulomb + bent - torque
+                found = found - over / np.maximum(self._viscous - self._steeper * found * bent, self._flattest)
         return np.where(rests, 0.0, np.copysign(found, driven))
