@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import OF_A_TRACE, OPTION, STATED, expectations_in, expectations_of
+from tdhil.config import OF_A_TRACE, OPTION, STATED, expectations_in, expectations_of, form_options
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session import (
@@ -51,8 +51,9 @@ def add_trace_arguments(parser: argparse.ArgumentParser, *, motion: bool = True)
     ``motion``: with the options of a periodic motion. They have no effect on a command that fits none.
     """
     trace = parser.add_argument_group("a trace in CSV (a run.mcap contains all this)")
+    left_out = [] if motion else [*form_options("motion"), *form_options("motion-file")]
     for option in OF_A_TRACE:
-        if not motion and option.name.startswith(("motion_", "excitation")):
+        if option in left_out:
             parser.set_defaults(**{option.name: None})
         elif option.joined:
             trace.add_argument(option.flag, dest=option.name, nargs="+", metavar=option.metavar,
