@@ -233,6 +233,8 @@ class _LoopModel:
         self.size = 11
         """Parameters: ln P, ln I, J, B, lags of the loop, reporting lag, delay, antiresonance, resonance, damping, and
         rounding of the report."""
+        self.prior = np.r_[0.0, 0.0, np.ones(self.size - 2)]
+        """Prior knowledge of each parameter, 1/variance."""
 
     def loop(self, theta: Reals) -> tuple[LoopPlant, PiGains]:
         """Return plant and gains for these parameters."""
@@ -369,7 +371,7 @@ def verify_steps(
     weight = sqrt(number) / max(float(scatter.std()), _LEAST_SD)
     near, _ = _fitted(model, mean, lambda x: weight * x, start)
     theta, slopes = _fitted(model, mean, whiten, near)
-    prior = np.diag(np.r_[0.0, 0.0, np.ones(model.size - 2)])
+    prior = np.diag(model.prior)
     inverse = np.linalg.inv(slopes.T @ slopes + prior)
     fitted = model.reported(theta)
     misfit = mean - fitted
@@ -425,13 +427,12 @@ def _fitted(
     now = model.reported(theta)
 
     def cost(response: Reals, at: Reals) -> float:
-        return float((whiten(mean - response) ** 2).sum()) + float((at[2:] ** 2).sum())
+        return float((whiten(mean - response) ** 2).sum()) + float((model.prior * at**2).sum())
 
-    prior = np.r_[0.0, 0.0, np.ones(model.size - 2)]
     slopes = whiten(_slopes(model, theta, now))
     for _ in range(_ROUNDS):
-        hessian = slopes.T @ slopes + np.diag(prior)
-        move = np.linalg.solve(hessian, slopes.T @ whiten(mean - now) - prior * theta)
+        hessian = slopes.T @ slopes + np.diag(model.prior)
+        move = np.linalg.solve(hessian, slopes.T @ whiten(mean - now) - model.prior * theta)
         move *= min(1.0, _LARGEST_MOVE / max(1e-12, float(np.max(np.abs(move[:2])))))
         before = cost(now, theta)
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):

@@ -45,6 +45,12 @@ def test_the_steps_stay_within_the_limits_and_end_at_rest(world):
     assert max(one.speed_rad_s for one in here.drive.commands) < LIMITS.speed_max_rad_s
 
 
+@pytest.mark.parametrize(("settling_s", "pairs"), [(0.1, 60), (0.7, 50), (6.0, 24)])
+def test_steps_that_settle_fast_are_repeated_more_often(settling_s, pairs):
+    case = replace(CASE, settling_s=Range(settling_s, settling_s, settling_s), reported_lag_s=Range(0.07, 0.07, 0.07))
+    assert plan_steps(case, LIMITS, PERIOD_S, SPEED_RESOLUTION, 800.0).pairs == pairs
+
+
 @pytest.mark.parametrize(("limits", "said"), [
     (replace(LIMITS, load="string", torque_ramp_nm_s=50.0), "load is string"),
     (replace(LIMITS, time_s=130.0), "the time limit leaves 10 s"),

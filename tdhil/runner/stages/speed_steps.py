@@ -57,10 +57,12 @@ def plan_steps(
                 "limits.torque_nm in rig.yaml", "Raise it within the machine's limits, or tune for a lower --bandwidth")
         step = counts * resolution_rad_s
     half_s = max(2, round(step_length_s(case) / period_s)) * period_s
-    pairs = min(max(FEWEST_PAIRS, min(MOST_PAIRS, int(PAIRS_S / (2.0 * half_s)))), int(left_s / (2.0 * half_s)) - 1)
+    pair_s = 2.0 * half_s
+    wanted = min(MOST_PAIRS, max(FEWEST_PAIRS, int(PAIRS_S / pair_s)))
+    pairs = min(wanted, int(left_s / pair_s) - 1)
     if pairs < LEAST_PAIRS:
         raise _refused(
-            f"{LEAST_PAIRS} pairs of steps take {2.0 * half_s * (LEAST_PAIRS + 1):.0f} s, and the time limit leaves"
+            f"{LEAST_PAIRS} pairs of steps take {pair_s * (LEAST_PAIRS + 1):.0f} s, and the time limit leaves"
             f" {max(0.0, left_s):.0f} s", "limits.time_s in rig.yaml", "Raise it")
     low = limits.speed_min_rad_s + 0.5 * (width - step)
     return StepProgram(low, low + step, half_s, pairs, resolution_rad_s)
