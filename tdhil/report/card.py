@@ -46,6 +46,14 @@ def part_with_interval(part: Mapping[str, Any], unit: str) -> str:
     return with_interval(part["value"], part["low"], part["high"], unit)
 
 
+def table_cell(part: Mapping[str, Any], times: float = 1.0) -> str:
+    """Return ``2.31 (2.22 to 2.42)`` without a unit, the value alone where it is exact, a dash where it is None."""
+    value, low, high = (None if part[name] is None else times * part[name] for name in ("value", "low", "high"))
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if low == high else "{} ({} to {})".format(*rounded(value, low, high))
+
+
 def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
     """Return the three values as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
     ends = [number for number in (low, high) if number is not None]

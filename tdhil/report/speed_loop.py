@@ -16,7 +16,7 @@ from rich.text import Text as Words
 from profiles import CodedText, MessageCode, entry_of, with_code
 from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
-from tdhil.report.card import part_with_interval
+from tdhil.report.card import part_with_interval, table_cell
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import marks, only_finite
 from tdhil.report.graphs import GRAPHS
@@ -310,10 +310,10 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
             + _margin(one["worst"], key, digits, unit) for one in every]
     yield "peak |S|, worst", [_number(one["worst"]["peak_sensitivity"], 2) if one["worst"]["stable"] else "!unstable"
                               for one in every]
-    yield "bandwidth, Hz", [_ends(one["bandwidth_hz"]) for one in every]
-    yield "step: overshoot, %", [_ends(one["overshoot_share"], 100.0) for one in every]
-    yield "step: rise 10–90 %, s", [_ends(one["rise_s"]) for one in every]
-    yield "step: settling, s", [_ends(one["settling_s"]) for one in every]
+    yield "bandwidth, Hz", [table_cell(one["bandwidth_hz"]) for one in every]
+    yield "step: overshoot, %", [table_cell(one["overshoot_share"], 100.0) for one in every]
+    yield "step: rise 10–90 %, s", [table_cell(one["rise_s"]) for one in every]
+    yield "step: settling, s", [table_cell(one["settling_s"]) for one in every]
 
 
 def _margin(part: Part, key: str, digits: int, unit: str) -> str:
@@ -323,13 +323,6 @@ def _margin(part: Part, key: str, digits: int, unit: str) -> str:
 
 def _number(value: float | None, digits: int) -> str:
     return "∞" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
-
-
-def _ends(part: Part, times: float = 1.0) -> str:
-    """Return ``2.31 (2.22–2.42)``."""
-    if part["value"] is None or part["high"] is None:
-        return "–"
-    return f"{times * part['value']:.3g} ({times * part['low']:.3g}–{times * part['high']:.3g})"
 
 
 def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:

@@ -24,7 +24,7 @@ from tdhil.report.blocks import (
     report_of_run,
     shown_date,
 )
-from tdhil.report.card import rounded
+from tdhil.report.card import table_cell
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import marks, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
@@ -91,7 +91,7 @@ def print_verification(document: Part, console: PlainConsole) -> None:
     if document["rows"]:
         console.print()
         grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-        grid.add_column("at the motor shaft")
+        grid.add_column("motor shaft")
         grid.add_column("measured", justify="right")
         grid.add_column("predicted or typed", justify="right")
         grid.add_column("")
@@ -121,15 +121,8 @@ def _table(document: Part) -> Iterator[tuple[str, str, str, str]]:
     """Yield name, measured, predicted, and whether both meet."""
     for row in document["rows"]:
         name, times = _NAMES[row["name"]]
-        yield (name, _ends(row["measured"], times), _ends(row["predicted"], times),
+        yield (name, table_cell(row["measured"], times), table_cell(row["predicted"], times),
                "agrees" if row["within"] else "differs")
-
-
-def _ends(part: Part, times: float) -> str:
-    value, low, high = (None if part[name] is None else times * part[name] for name in ("value", "low", "high"))
-    if value is None:
-        return "–"
-    return f"{value:.4g}" if low == high else "{} ({}–{})".format(*rounded(value, low, high))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

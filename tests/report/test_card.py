@@ -18,6 +18,7 @@ from tdhil.report.card import (
     plus_minus,
     plus_minus_part,
     print_card,
+    table_cell,
     with_interval,
 )
 from tdhil.report.document import result_document
@@ -98,6 +99,15 @@ def test_digits_follow_the_half_width():
     assert plus_minus(5.0, float("inf")) == "5"
     assert with_interval(-0.0003, -0.014, 0.016, "s") == "0.000 (-0.014 to 0.016) s"
     assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±13 %", "±0.034 %"]
+
+
+def test_a_cell_of_a_table_rounds_its_interval_outwards_and_writes_no_powers_of_ten():
+    assert table_cell({"value": 2.401, "low": 2.2949, "high": 2.5012}) == "2.40 (2.29 to 2.51)"
+    assert table_cell({"value": 1603.4, "low": 1204.0, "high": 2003.0}) == "1600 (1200 to 2010)"
+    assert table_cell({"value": 0.293, "low": 0.253, "high": 0.341}, 100.0) == "29.3 (25.3 to 34.1)"
+    assert table_cell({"value": 1603.4, "low": 1603.4, "high": 1603.4}) == "1603"
+    assert table_cell({"value": 2.4, "low": 2.29, "high": None}) == "2.4 (2.29 to open)"
+    assert table_cell({"value": None, "low": None, "high": None}) == "–"
 
 
 def test_a_printed_interval_contains_the_true_one():
