@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         Evaluation as Evaluation, EvaluationCase as EvaluationCase, EvaluationRefused as EvaluationRefused,
         EvaluationOutcome as EvaluationOutcome, Prediction as Prediction, Trial as Trial, RigWindow as RigWindow,
         case_of as case_of,
-        evaluate as evaluate, program_for as program_for, refuse_untrue as refuse_untrue,
+        evaluate as evaluate, program_for as program_for, check_virtual_string as check_virtual_string,
     )
     from tdhil.soft_torque.own_units import (
         DriveSetting as DriveSetting, drive_settings as drive_settings, notch_settings as notch_settings,
@@ -87,7 +87,7 @@ else:
                       "impedance inner_lags margins reflection reflection_at softest_allowed stiff_controller "
                       "tuned_controller",
         "evaluation": "Evaluation EvaluationCase EvaluationRefused EvaluationOutcome Prediction Trial RigWindow "
-                      "case_of evaluate program_for refuse_untrue",
+                      "case_of evaluate program_for check_virtual_string",
         "own_units": "DriveSetting drive_settings notch_settings one_percent_nm_s_rad",
         "roots": "RootsLost count_in roots_in",
         "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",

@@ -114,7 +114,7 @@ class EvaluationCase:
         return found
 
 
-def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
+def check_virtual_string(case: EvaluationCase, period_s: float) -> None:
     """Check the bit, the mud's drag, the cycle rate, the rig's inertia and the lag of the reported speed.
 
     Raises EvaluationRefused if one of them would make the virtual string incorrect.

@@ -27,8 +27,8 @@ from tdhil.soft_torque import (
     Phase,
     RigWindow,
     SpeedProgram,
+    check_virtual_string,
     program_for,
-    refuse_untrue,
 )
 
 STRANGE_SHARE, STRANGE_COUNTS, STRANGE_SDS = 0.015, 8.0, 6.0
@@ -60,7 +60,7 @@ def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, fore
             next_step="Evaluate before the string is connected",
             entry=MessageCode.VIRTUAL_STRING_REFUSED,
         )
-    refuse_untrue(case, period_s)
+    check_virtual_string(case, period_s)
     window = RigWindow(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, foresight_s)
     program = program_for(case, window)
     needed_s = program.longest_s + BEFORE_S + RESERVE_S
