@@ -125,6 +125,7 @@ _IGNORED: Final = re.compile(r"[\s·.*⋅_^⁻-]")
 _NUMBER: Final = re.compile(
     r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)(?![0-9])\s*(\S.*)?", re.DOTALL
 )
+_COMMA: Final = re.compile(r",[0-9]")
 _LONGEST: Final = 60
 """Longest text of a quantity, characters."""
 
@@ -210,6 +211,8 @@ def read(text: str, unit: Unit) -> float:
         raise ValueError(f"must be a number and its unit, such as '3 {example(unit)}'")
     value, word = parts
     given = unit_of(word) if word else unit
+    if given is None and _COMMA.match(word):
+        raise ValueError("a number has a decimal point and no comma")
     if given is None:
         raise ValueError(f"'{word}' is not a unit of {unit.dimension}; use {', '.join(known(unit))}")
     if given.dimension != unit.dimension:

@@ -181,7 +181,7 @@ def _finish(
     ending.calm()
     try:
         if document is not None:
-            print_result(document, options.json)
+            print_result(document, options.json, of_motion=True)
     finally:            # stdout may be closed: log and report are finished nevertheless
         try:
             session.close()

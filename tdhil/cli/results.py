@@ -46,8 +46,12 @@ def print_json(document: Mapping[str, Any]) -> None:
     sys.stdout.write("\n")
 
 
-def print_result(document: Mapping[str, Any], as_json: bool) -> None:
-    """Print one JSON document, or the card, on stdout. If stdout fails, print the card on stderr and raise."""
+def print_result(document: Mapping[str, Any], as_json: bool, *, of_motion: bool = False) -> None:
+    """Print one JSON document, or the card, on stdout. If stdout fails, print the card on stderr and raise.
+
+    A closed pipe counts as a failure only if the shaft moved for this result (``of_motion``): the reader of a replay,
+    such as `head`, has read enough.
+    """
     from tdhil.report import PlainConsole
 
     if _is_evaluation(document):
@@ -62,8 +66,9 @@ def print_result(document: Mapping[str, Any], as_json: bool) -> None:
         else:
             show(document, PlainConsole())
         sys.stdout.flush()
-    except (BrokenPipeError, OutputLost):
-        show(document, PlainConsole(sys.stderr))
+    except (BrokenPipeError, OutputLost) as error:
+        if isinstance(error, OutputLost) or of_motion:
+            show(document, PlainConsole(sys.stderr))
         raise
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import os
 import subprocess
 import sys
 
@@ -87,6 +88,17 @@ def test_a_full_device(log, monkeypatch):
     assert "stdout: can't be written: No space left on device" in err
     assert "kg·m²" in err                  # the card
     assert "Traceback" not in err
+
+
+@pytest.mark.heavy
+def test_a_replay_into_a_closed_pipe_prints_nothing_else(log):
+    """``tdhil replay run.mcap | head -n 1``: the reader has read enough."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run([sys.executable, "-m", "tdhil", "replay", str(log)], stdout=writing, stderr=subprocess.PIPE,
+                          timeout=600, env=clean_environment())
+    os.close(writing)
+    assert done.stderr == b""
 
 
 @pytest.mark.heavy

@@ -55,6 +55,12 @@ def test_what_could_mean_something_else_is_not_read(text, unit):
     assert "write" not in str(caught.value)      # no number is offered: who wrote a unit meant it
 
 
+@pytest.mark.parametrize("text", ["0,5", "0,5 Hz", "1,000 Hz"])
+def test_a_comma_is_named_as_the_mistake(text):
+    with pytest.raises(ValueError, match="^a number has a decimal point and no comma$"):
+        q.read(text, q.FREQUENCY)
+
+
 @pytest.mark.heavy
 @given(st.text(max_size=30), st.sampled_from([q.SPEED, q.TORQUE, q.TIME, q.SHARE, q.BIT_RATE]))
 def test_anything_typed_is_a_finite_number_or_refused(text, unit):
