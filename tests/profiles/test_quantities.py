@@ -57,7 +57,7 @@ def test_what_could_mean_something_else_is_not_read(text, unit):
 
 @pytest.mark.parametrize("text", ["0,5", "0,5 Hz", "1,000 Hz"])
 def test_a_comma_is_named_as_the_mistake(text):
-    with pytest.raises(ValueError, match="^a number has a decimal point and no comma$"):
+    with pytest.raises(ValueError, match="a decimal point and no comma"):
         q.read(text, q.FREQUENCY)
 
 
