@@ -176,8 +176,9 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
                        " and whether it turned with the shaft; then repeat that run")
     assumed = student_quantile(case.confidence, CERTAIN) * case.scale_rel_sd
     if inertia.half_width_share > assumed:
-        reason = (f"the body of {float(np.ptp(added)):.4g} kg·m² is too small: it would leave J at"
-                  f" ±{inertia.half_width_share:.1%}, and the stated torque scale leaves ±{assumed:.1%}")
+        reason = (f"the body of {float(np.ptp(added)):.4g} kg·m² is too small: it would leave J at "
+                  f"±{100 * inertia.half_width_share:.1f} %, and the stated torque scale leaves "
+                  f"±{100 * assumed:.1f} %")
         advice = "measure for longer, and state how well the body's inertia is known (--added-sd)"
         if least is not None:
             advice = f"use a body of {least:.3g} kg·m² or more at the motor, or measure for longer"
@@ -187,9 +188,10 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
         factor.standard_uncertainty)
     if abs(factor.value - 1.0) > most:
         return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value),
-                       reason=f"the calibration factor would be {factor.value:.3g}: more than {most:.0%} from 1 is no"
-                       " error of a torque scale")
-    reason = f"the runs give κ to ±{factor.half_width_share:.2%} and J to ±{inertia.half_width_share:.2%}"
+                       reason=f"the calibration factor would be {factor.value:.3g}: more than {100 * most:.0f} % from "
+                       "1 is no error of a torque scale")
+    reason = (f"the runs give κ to ±{100 * factor.half_width_share:.2f} % and J to "
+              f"±{100 * inertia.half_width_share:.2f} %")
     return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia)
 
 

@@ -112,12 +112,13 @@ def calibrate_known_pipe(
     if factor.half_width_share >= typed:
         worst = max(budget, key=lambda line: line.of_factor)
         return KnownPipeFit(
-            factor, budget, typed, f"the pipe gives κ = {value:.3f} to ±{factor.half_width_share:.1%} only, which is"
-            f" wider than the torque scale as stated so far (±{typed:.1%}); most comes from: {worst.source}",
+            factor, budget, typed, f"the pipe gives κ = {value:.3f} to ±{100 * factor.half_width_share:.1f} % only, "
+            f"which is wider than the torque scale as stated so far (±{100 * typed:.1f} %); "
+            f"most comes from: {worst.source}",
             "state the measured sizes of the pipe with their tolerances in string.yaml, or use a body of known inertia")
     if abs(value - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:
         return KnownPipeFit(
-            factor, budget, typed, f"the calibration factor would be {value:.3g}: more than {LARGEST_ERROR:.0%} from 1"
-            " is no error of a torque scale",
+            factor, budget, typed, f"the calibration factor would be {value:.3g}: more than {100 * LARGEST_ERROR:.0f} "
+            "% from 1 is no error of a torque scale",
             "compare the diameters in string.yaml with the pipe, and the gear ratio with the drive")
     return fit

@@ -120,8 +120,8 @@ def calibrate_pairs(pairs: TorquePairs, confidence: float = 0.95) -> PairsFit:
     factor = measured_value(slope, factor_sd, effective, confidence)
     refusal = ""
     if not abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
-        refusal = (f"the calibration factor would be {slope:.3g}: more than {LARGEST_ERROR:.0%} from 1 is no error of a"
-                   " torque scale; check units, signs, and the shaft that the reference stands at")
+        refusal = (f"the calibration factor would be {slope:.3g}: more than {100 * LARGEST_ERROR:.0f} % from 1 is no "
+                   "error of a torque scale; check units, signs, and the shaft that the reference stands at")
     elif statistic.p_value < CONTRADICTED_P and abs(hysteresis or 0.0) < float(np.std(left)) and _bent(pairs, left):
         refusal = "the reference torque is no straight line over the reported one: its residuals are curved"
     return PairsFit(factor, measured_value(intercept, math.sqrt(covariance[1, 1]), dof, confidence), covariance, left,

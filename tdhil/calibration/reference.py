@@ -438,10 +438,11 @@ def _judged(
     if factor.half_width_share > assumed:
         return replace(
             found, refusal=f"the torque varies too little: {found.swing_nm:.3g} N·m leave κ at"
-            f" ±{factor.half_width_share:.1%}, and the stated torque scale leaves ±{assumed:.1%}",
+            f" ±{100 * factor.half_width_share:.1f} %, and the stated torque scale leaves ±{100 * assumed:.1f} %",
             advice="change the torque by more, in steps and slowly, or record for longer")
     if abs(k - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:
         return replace(
-            found, refusal=f"the calibration factor would be {k:.3g}: more than {LARGEST_ERROR:.0%} from 1 is no error"
-            " of a torque scale", advice="check the unit of the reference, and the shaft that it stands at (--at)")
+            found, refusal=f"the calibration factor would be {k:.3g}: more than {100 * LARGEST_ERROR:.0f} % from 1 is "
+            "no error of a torque scale",
+            advice="check the unit of the reference, and the shaft that it stands at (--at)")
     return found

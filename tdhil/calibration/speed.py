@@ -141,13 +141,14 @@ def _concluded(
         if least is not None:
             advice = f"count {least} turns or more at this speed, or state a smaller uncertainty of what was read"
         return SpeedCalibration(
-            Verdict.NOT_IDENTIFIABLE, f"the measurement is too short: it would leave the factor at"
-            f" ±{factor.half_width_share:.2%}, and ±{wanted:.2%} is wanted", advice, method, budget=budget,
-            least_turns=least)
+            Verdict.NOT_IDENTIFIABLE, f"the measurement is too short: it would leave the factor at "
+            f"±{100 * factor.half_width_share:.2f} %, and ±{100 * wanted:.2f} % is wanted",
+            advice, method, budget=budget, least_turns=least)
     if not abs(value - 1.0) <= LARGEST_ERROR + factor.half_width_share:
         return SpeedCalibration(
-            Verdict.MODEL_REJECTED, f"the calibration factor would be {value:.4g}: more than {LARGEST_ERROR:.0%} from 1"
-            " is no error of a scale but a wrong unit", "check the unit of speed in the profile, the counted turns, and"
-            " the shaft at which they were counted (--at motor or main)", method, budget=budget)
-    return SpeedCalibration(Verdict.VALID, f"the factor is known to ±{factor.half_width_share:.2%}", "", method, factor,
-                            budget)
+            Verdict.MODEL_REJECTED, f"the calibration factor would be {value:.4g}: more than "
+            f"{100 * LARGEST_ERROR:.0f} % from 1 is no error of a scale but a wrong unit",
+            "check the unit of speed in the profile, the counted turns, and the shaft at which they were counted "
+            "(--at motor or main)", method, budget=budget)
+    return SpeedCalibration(Verdict.VALID, f"the factor is known to ±{100 * factor.half_width_share:.2f} %", "", method,
+                            factor, budget)

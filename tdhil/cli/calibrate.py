@@ -212,10 +212,11 @@ def _plan(namespace: argparse.Namespace) -> int:
 
     table = Table(title=f"J {inertia:.4g} kg·m² in the drive's unit; stage 5 took {minutes:.1f} min", box=None,
                   title_justify="left", padding=(0, 3))
-    for name in (f"body, kg·m² ({namespace.at})", "J after two such runs", f"minutes each for ±{namespace.want:.2%}"):
+    wanted = f"minutes each for ±{100 * namespace.want:.2f} %"
+    for name in (f"body, kg·m² ({namespace.at})", "J after two such runs", wanted):
         table.add_column(name, justify="right")
     for one in plans:
         longer = "not in a day" if one.minutes is None else f"{math.ceil(10.0 * one.minutes) / 10.0:.1f}"
-        table.add_row(f"{one.added_kg_m2 * ratio**2:.4g}", f"±{one.half_width_share:.2%}", longer)
+        table.add_row(f"{one.added_kg_m2 * ratio**2:.4g}", f"±{100 * one.half_width_share:.2f} %", longer)
     PlainConsole().print(table)
     return int(ExitCode.OK)

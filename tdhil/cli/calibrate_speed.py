@@ -167,7 +167,7 @@ def _found(
     assumed = {"turns_sd": f"of the count was assumed to be {TURNS_SD:g} turns",
                "seconds_sd": f"of the time was assumed to be {SECONDS_SD:g} s"}
     if record is None:
-        assumed["speed_sd"] = f"of the mean speed was assumed to be {SPEED_REL_SD:.1%} of it"
+        assumed["speed_sd"] = f"of the mean speed was assumed to be {100 * SPEED_REL_SD:.1f} % of it"
     inputs = {**asdict(counted), "counted_turns": namespace.turns, "at": namespace.at, "gear_ratio": ratio}
     return found, inputs, tuple(f"the standard uncertainty {text}; state it with {_flag(name)}"
                                 for name, text in assumed.items() if getattr(namespace, name) is None)

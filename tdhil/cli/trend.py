@@ -140,8 +140,9 @@ def _followed_text(one: Mapping[str, Any]) -> str:
 
 def _print_compared(document: Mapping[str, Any]) -> None:
     from rich.table import Table
+    from rich.text import Text as Words
 
-    from tdhil.report import PlainConsole, rounded
+    from tdhil.report import PlainConsole, names_and_texts, rounded
 
     console = PlainConsole()
     if document["simulated"]:
@@ -162,11 +163,11 @@ def _print_compared(document: Mapping[str, Any]) -> None:
         table.add_row("", f"apparent J, {hertz:.4g} Hz", *("–" if one is None else f"{one:#.4g}" for one in values))
     console.print(table)
     for one in document["differences"]:
-        console.print(f"{one['from']} and {one['to']}: {one['text']}", soft_wrap=True)
-        rest = [f"{other['name']}: {'differs' if other['differs'] else 'no significant difference'}"
-                for other in one["quantities"] if other["column"] != "inertia_kg_m2"]
-        if rest:
-            console.print("  " + ", ".join(rest), soft_wrap=True)
+        console.print()
+        console.print(Words(f"{one['from']} and {one['to']}", style="bold"))
+        console.print(names_and_texts((("J", one["text"]), *(
+            (other["name"], "differs" if other["differs"] else "no significant difference")
+            for other in one["quantities"] if other["column"] != "inertia_kg_m2"))))
 
 
 def _marks(document: Mapping[str, Any]) -> str:

@@ -283,7 +283,7 @@ def _widened(
     if finding.inertia is None or half is None:
         return replace(finding, words=replace(finding.words, if_rejected=_ADVICE),
                        warnings=(*finding.warnings, CodedText(text, MessageCode.BACKLASH_FOUND)))
-    text = f"{text}; it widens J by {half / finding.inertia.value:.2%}"
+    text = f"{text}; it widens J by {100 * half / finding.inertia.value:.2f} %"
     return widened(
         replace(finding, warnings=(*finding.warnings, CodedText(text, MessageCode.BACKLASH_FOUND))), half, "backlash",
         "its change of the excited lines")

@@ -74,13 +74,13 @@ def _judged(
     if finding.inertia is None or inertia is None:
         refused = finding.refusal
         return Verdict.NOT_IDENTIFIABLE, refused.reason, refused.advice, refused.entry
-    wide = f"wider than ±{options.tolerance:.2%}"
+    wide = f"wider than ±{100 * options.tolerance:.2f} %"
     own = 0.5 * (finding.inertia.high - finding.inertia.low) / finding.inertia.value
     whole = 0.5 * (inertia.high - inertia.low) / inertia.value
     if not own <= options.tolerance:
-        reason = f"{finding.explained}, but the {finding.words.spread} is ±{own:.2%}, {wide}"
+        reason = f"{finding.explained}, but the {finding.words.spread} is ±{100 * own:.2f} %, {wide}"
         return Verdict.VALID_WIDE, reason, finding.advice or finding.words.if_wide, MessageCode.VALID_WIDE
     if whole > options.tolerance:
-        reason = f"{finding.explained}, but the interval is ±{whole:.2%}, {wide}"
+        reason = f"{finding.explained}, but the interval is ±{100 * whole:.2f} %, {wide}"
         return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER, MessageCode.VALID_WIDE
     return Verdict.VALID, finding.explained, finding.advice or _SHARPER, MessageCode.VALID

@@ -52,7 +52,7 @@ def check_limited(
     count = sum(len(flag) for flag in flags)
     flagged = sum(int(np.count_nonzero(flag)) for flag in flags) / count if count else 0.0
     if flagged > LIMIT_SHARE:
-        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the excitation", _ADVICE,
+        raise Refused(f"the drive was at an internal limit for {100 * flagged:.1f} % of the excitation", _ADVICE,
                       entry=MessageCode.SIGNAL_CLIPPED)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
@@ -63,7 +63,7 @@ def check_limited(
         )
         saturated = hits / sum(len(part) for _, part in parts)
         if saturated > LIMIT_SHARE:
-            reason = f"the torque was at its limit of {limit:g} N·m for {saturated:.1%} of the excitation"
+            reason = f"the torque was at its limit of {limit:g} N·m for {100 * saturated:.1f} % of the excitation"
             raise Refused(reason, _ADVICE)
     if has_plateaus(kind):
         return
@@ -76,7 +76,7 @@ def check_limited(
             if share is not None:
                 where = f"about {segment.offset_rad_s:.3g} rad/s"
                 raise Refused(
-                    f"the {name} is cut off flat for {share:.1%} of the excitation {where}",
+                    f"the {name} is cut off flat for {100 * share:.1f} % of the excitation {where}",
                     f"{_ADVICE}; or widen the range in which the {name} is reported",
                     entry=MessageCode.SIGNAL_CLIPPED,
                 )
@@ -246,12 +246,12 @@ def check_samples(recording: Recording) -> None:
     fresh_count = int(np.count_nonzero(fresh))
     bad = 1.0 - np.count_nonzero(finite & fresh) / fresh_count if fresh_count else 0.0
     if bad > LIMIT_SHARE:
-        raise Refused(f"{bad:.0%} of the samples are not numbers", "look for a decoding or wiring fault",
+        raise Refused(f"{100 * bad:.0f} % of the samples are not numbers", "look for a decoding or wiring fault",
                       entry=MessageCode.DATA_UNUSABLE)
     stale = 1.0 - fresh_count / count
     if stale > 1.0 - _STALE_SHARE:
-        raise Refused(f"{stale:.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus",
-                      entry=MessageCode.DATA_UNUSABLE)
+        raise Refused(f"{100 * stale:.0f} % of the samples brought nothing new",
+                      "lower the cycle rate or repair the bus", entry=MessageCode.DATA_UNUSABLE)
     for name, signal in (("speed", recording.speed_rad_s), ("torque", recording.torque_nm)):
         largest = max(abs(float(np.max(signal, where=finite, initial=0.0))),
                       abs(float(np.min(signal, where=finite, initial=0.0))))

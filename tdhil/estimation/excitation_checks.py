@@ -90,13 +90,13 @@ def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> No
         where = f"about {segment.offset_rad_s:.3g} rad/s"
         if at_rest > _LEAST_SHARE * len(part):
             raise Refused(
-                f"stick-slip: the shaft stood still for {at_rest / len(part):.1%} of the excitation {where}",
+                f"stick-slip: the shaft stood still for {100 * at_rest / len(part):.1f} % of the excitation {where}",
                 "raise the mean speed or lower the amplitude, so that the shaft never stops",
                 entry=MessageCode.STICK_SLIP_RECORDED,
             )
         if behind > _LEAST_SHARE * len(part):
             raise Refused(
-                f"the shaft turned backwards for {behind / len(part):.1%} of the excitation {where}",
+                f"the shaft turned backwards for {100 * behind / len(part):.1f} % of the excitation {where}",
                 "raise the mean speed or lower the amplitude. Friction jumps at zero speed",
                 entry=MessageCode.SHAFT_TURNED_BACK,
             )
@@ -135,7 +135,7 @@ def check_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) 
     declared = stretches[0].segment.period_s
     raise Refused(
         f"the motion repeats every {declared * (1.0 + found):.6g} s, not every {declared:g} s as declared: the time "
-        f"base or the declared period is wrong by {abs(found):.2%}",
+        f"base or the declared period is wrong by {100 * abs(found):.2f} %",
         "declare the period and the lines as they were run, and check the rate of the time stamps",
         entry=MessageCode.EXCITATION_MISDECLARED,
     )

@@ -175,7 +175,8 @@ def log_warnings(recording: Recording) -> tuple[str, ...]:
         found.append(CodedText("the log ended before the run did: partial data", MessageCode.PARTIAL_DATA))
     stale = float((~recording.fresh).mean())
     if stale > 0.01:
-        found.append(CodedText(f"{stale:.1%} of the samples were stale and left out", MessageCode.STALE_SAMPLES))
+        found.append(CodedText(f"{100 * stale:.1f} % of the samples were stale and left out",
+                               MessageCode.STALE_SAMPLES))
     return tuple(found)
 
 
@@ -197,7 +198,7 @@ def left_out_warnings(recording: Recording) -> tuple[str, ...]:
         where, share = float(recording.time_s[np.argmax(stuck)]), float(np.mean(stuck))
         said.append(CodedText(
             f"the feedback did not change although it was marked as fresh, first at {where:.6g} s. tdhil left out "
-            f"{share:.1%} of the samples",
+            f"{100 * share:.1f} % of the samples",
             MessageCode.SAMPLES_LEFT_OUT,
         ))
     return tuple(said)

@@ -57,7 +57,7 @@ def stretched(finding: Finding, recording: Recording) -> Finding:
         finding,
         advice="shorten the cycle (baud rate, function 23, TCP), or use a drive's torque mode",
         warnings=(*finding.warnings, CodedText(
-            f"{note}. This alone may change J by {share:.1%}",
+            f"{note}. This alone may change J by {100 * share:.1f} %",
             MessageCode.STEPPED_SETPOINT)),
     )
 

@@ -163,7 +163,7 @@ def check_evidence(archive: bytes, sha256: str = "", *, conclude: Conclude | Non
                 problems.append("the statement and the log differ on whether the drive is simulated")
             if version != __version__:
                 notes.append(f"made by tdhil {version}, checked by {__version__}: the result may differ by up to"
-                             f" {OTHER_VERSION:.0%}")
+                             f" {100 * OTHER_VERSION:.0f} %")
             if conclude is None:
                 notes.append("the log was not identified again")
             elif text := _difference(stated, conclude(copy), _REPLAYED if version == __version__ else OTHER_VERSION):

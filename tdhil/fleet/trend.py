@@ -221,7 +221,7 @@ def _between(change: Mapping[str, Any]) -> str:
 def _change_text(change: Difference, unit: str) -> str:
     if change.relative:
         low, high = printed_ends(100.0 * change.low, 100.0 * change.high, 2)
-        return f"{change.change:+.2%} ({_signed(low)}% to {_signed(high)}%)"
+        return f"{100 * change.change:+.2f} % ({_signed(low)} % to {_signed(high)} %)"
     return f"{change.change:+.4g} ({printed_interval(change.low, change.high, sign=True)}) {unit}"
 
 
@@ -354,7 +354,7 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
         text = f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"
     else:
         change = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
-        scale = "the torque scale is one drive's and cancels" if change.shared_scale else (
+        scale = "the same drive: its torque scale cancels" if change.shared_scale else (
             "two torque calibrations: the scale of each is in it"
             if first.torque_calibration != other.torque_calibration
             else "two drives: the torque scale of each is in it")
@@ -362,5 +362,6 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
             scale = "no serial numbers: taken for one drive, whose torque scale cancels"
         says = "differ" if change.differs else "do not differ significantly"
         parts = "".join(f"; {row.log}: {row.part_text}" for row in (first, other) if row.part_text is not None)
-        text = f"the inertias {says}: {_change_text(change, 'kg·m²')} at {change.confidence:.0%}; {scale}{parts}"
+        size = f"{_change_text(change, 'kg·m²')} at {100 * change.confidence:.0f} %"
+        text = f"the inertias {says}: {size}; {scale}{parts}"
     return found | {"text": text}

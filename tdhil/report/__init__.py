@@ -14,7 +14,9 @@ if TYPE_CHECKING:
         card_html as card_html, card_text as card_text, inertia_text as inertia_text, minutes as minutes,
         print_card as print_card, rounded as rounded, with_interval as with_interval,
     )
-    from tdhil.report.console import PlainConsole as PlainConsole, stderr_console as stderr_console
+    from tdhil.report.console import (
+        PlainConsole as PlainConsole, names_and_texts as names_and_texts, stderr_console as stderr_console,
+    )
     from tdhil.report.document import (
         SIMULATED as SIMULATED, marks as marks, rehearsal_of as rehearsal_of, rehearsed_faults as rehearsed_faults,
         result_document as result_document, run_facts as run_facts, text_of as text_of,
@@ -80,7 +82,7 @@ else:
         "acceptance": "AcceptanceVerdict acceptance_of",
         "blocks": "Column Picture Report ReportSection Table Text reference_of shown_date",
         "card": "card_html card_text inertia_text minutes print_card rounded with_interval",
-        "console": "PlainConsole stderr_console",
+        "console": "PlainConsole names_and_texts stderr_console",
         "document": "SIMULATED marks rehearsal_of rehearsed_faults result_document run_facts text_of",
         "verification": "print_verification verification_document verification_report write_verification_report",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",

@@ -49,7 +49,8 @@ def pairs_document(
     """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log."""
     return {
         **_begun(PAIRS, "model_rejected" if found.refusal else "valid",
-                 found.refusal or f"{len(pairs.direction)} pairs give κ to ±{found.factor.half_width_share:.2%}", ""),
+                 found.refusal or (f"{len(pairs.direction)} pairs give κ to "
+                                   f"±{100 * found.factor.half_width_share:.2f} %"), ""),
         "calibration_factor": None if found.refusal else quantity(found.factor, confidence),
         "offset_nm": quantity(found.offset_nm, confidence),
         "budget": _budget_lines(found.budget),
@@ -77,7 +78,7 @@ def reference_document(
     factor = found.factor
     reason = found.refusal
     if not reason and factor is not None:
-        reason = (f"{found.overlap_s:.0f} s of both records give κ to ±{factor.half_width_share:.2%}")
+        reason = (f"{found.overlap_s:.0f} s of both records give κ to ±{100 * factor.half_width_share:.2f} %")
     series = found.series
     return {
         **_begun(REFERENCE, "not_identifiable" if found.refusal else "valid", reason, found.advice),
@@ -108,8 +109,8 @@ def known_pipe_document(
     verdict = "not_identifiable" if reason else "valid"
     factor = None if found is None else quantity(found.factor, confidence)
     if found is not None and not reason:
-        reason = (f"the pipe gives κ to ±{found.factor.half_width_share:.2%}; the torque scale as stated so far leaves"
-                  f" ±{found.typed_half_width:.1%}")
+        reason = (f"the pipe gives κ to ±{100 * found.factor.half_width_share:.2f} %; the torque scale as stated so "
+                  f"far leaves ±{100 * found.typed_half_width:.1f} %")
     return {
         **_begun(KNOWN_PIPE, verdict, reason, advice),
         "calibration_factor": None if verdict != "valid" else factor,

@@ -216,7 +216,7 @@ class Guard:
         if late > LATE_SHARE * cycles:
             words = self.host_late()
             raise CommunicationLost(
-                f"the control loop was late in {late} of {cycles} cycles (limit {LATE_SHARE:.0%})"
+                f"the control loop was late in {late} of {cycles} cycles (limit {100 * LATE_SHARE:.0f} %)"
                 + (f": {words}" if words else ""),
                 where="host",
                 next_step=f"{LOWER_THE_RATE}; or end other programs on this computer",

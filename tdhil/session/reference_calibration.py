@@ -47,8 +47,8 @@ def find_by_reference(
     rel_sd = reference_rel_sd
     if rel_sd is None:
         rel_sd = ASSUMED_REFERENCE_REL_SD
-        warnings.append(f"the standard uncertainty of the sensor's scale was assumed to be {rel_sd:.1%} (accuracy class"
-                        " 0.5); state it with --reference-sd")
+        warnings.append(f"the standard uncertainty of the sensor's scale was assumed to be {100 * rel_sd:.1f} % "
+                        "(accuracy class 0.5); state it with --reference-sd")
     good = recording.fresh
     drive = TorqueRecord(recording.time_s[good], recording.torque_nm[good] - recording.torque_offset_nm,
                          recording.torque_resolution_nm)

@@ -182,7 +182,8 @@ def read(
     motion = Path(excitation) if isinstance(excitation, str) else excitation
     recording, assumed = read_recording(path, choices, motion, bench)
     if scale is None:
-        assumed = (*assumed, f"standard uncertainty of the torque scale, assumed: {ASSUMED_TORQUE_SCALE_REL_SD:.0%}")
+        share = f"{100 * ASSUMED_TORQUE_SCALE_REL_SD:.0f} %"
+        assumed = (*assumed, f"standard uncertainty of the torque scale, assumed: {share}")
     return RunRecord(recording, {"identify": {one.name: one.default for one in ASKED_AGAIN}}, str(path), assumed)
 
 

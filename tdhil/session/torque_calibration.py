@@ -80,7 +80,7 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
     warnings = []
     if any(run.added_kg_m2 and run.added_sd_kg_m2 is None for run in runs):
         warnings.append("state the standard uncertainty of the body: it is not given, and"
-                        f" {ASSUMED_BODY_REL_SD:.1%} of its inertia is assumed")
+                        f" {100 * ASSUMED_BODY_REL_SD:.1f} % of its inertia is assumed")
     if any(not drive_identity(run.record.configuration) for run in runs):
         warnings.append("a trace does not name its drive: whether all are of the same drive was not checked")
     refusal = _refusal(runs, identified)

@@ -78,7 +78,7 @@ def known(half):
 def test_a_pipe_that_is_known_worse_than_the_scale_is_refused_with_its_worst_line():
     usual = known_pipe_of(string_file({}), 1.0)
     fit = calibrate_known_pipe(usual, measured(usual.value))
-    assert "wider than the torque scale as stated so far (±3.9%)" in fit.refusal
+    assert "wider than the torque scale as stated so far (±3.9 %)" in fit.refusal
     assert "wear of the pipe" in fit.refusal
     assert calibrate_known_pipe(usual, measured(usual.value), scale_rel_sd=0.1).refusal == ""
 

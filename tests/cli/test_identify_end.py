@@ -52,7 +52,8 @@ def ends(monkeypatch, tmp_path, capsys):
 
         monkeypatch.setattr("tdhil.session.run_session.Runner", Fake)
         monkeypatch.setattr("tdhil.session.conclusion.conclude", conclude)
-        monkeypatch.setattr("tdhil.cli.results.print_result", lambda document, _: print(json.dumps(document)))
+        monkeypatch.setattr(
+            "tdhil.cli.results.print_result", lambda document, _, *, of_motion: print(json.dumps(document)))
         code = main(["identify", "--simulate", "--seed", "1", *arguments])
         said = capsys.readouterr()
         return code, said.out, " ".join(said.err.split())

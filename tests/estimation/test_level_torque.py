@@ -68,7 +68,7 @@ def test_above_a_string_of_unknown_inertia_the_result_states_what_stays_hidden(r
     ratios = [one.ratio for one in level_torques(recording, case.samples)]
     seen = min(max(ratio / LEAST, MOST / ratio) for ratio in ratios) - 1.0
     assert [one.entry for one in checked.warnings] == [MessageCode.SCALE_CHANGE_HIDDEN]
-    assert f"of less than {seen:.0%}" in checked.warnings[0]
+    assert f"of less than {100 * seen:.0f} %" in checked.warnings[0]
     assert checked.second_opinions[0].least_scale_change == pytest.approx(seen)
     rigid = cross_checked(part, replace(case, recording=recorded[0]))
     assert rigid.warnings == () and rigid.second_opinions[0].least_scale_change is None

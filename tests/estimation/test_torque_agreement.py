@@ -153,7 +153,7 @@ def test_a_difference_that_the_scale_allows_widens_it_until_both_torques_fit(run
     found = identify(replace(runs[0], torque_nm=scale * runs[0].torque_nm), Options(tolerance=0.2))
     assert found.verdict is Verdict.VALID
     assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
-    assert any("torque scale was widened from 2.00%" in warning for warning in found.warnings)
+    assert any("torque scale was widened from 2.00 %" in warning for warning in found.warnings)
 
 
 @pytest.mark.heavy
@@ -179,7 +179,7 @@ def test_the_least_change_of_a_scale_that_shows_is_told(runs):
     for one in runs:
         opinion = identify(one).second_opinions[0]
         least = opinion.least_scale_change
-        at_stage_5, *at_stage_2 = map(int, re.findall(r"±(\d+)% or more at stage", opinion.note))
+        at_stage_5, *at_stage_2 = map(int, re.findall(r"±(\d+) % or more at stage", opinion.note))
         assert round(100.0 * least) == max([at_stage_5, *at_stage_2])
         assert 5 <= at_stage_5 < 25
         speed = np.where(one.time_s < 43.0, 1.0, 1.0 - 0.012 * at_stage_5) * one.speed_rad_s

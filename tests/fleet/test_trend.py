@@ -140,7 +140,7 @@ def test_inertias_of_different_bodies_are_never_one_series():
 
 def test_the_interval_of_a_change_is_rounded_outwards():
     assert _change_text(Difference(0.0212, 0.02046, 0.02194, 0.95, True, True, 1.0), "kg·m²") == (
-        "+2.12% (+2.04% to +2.20%)")
+        "+2.12 % (+2.04 % to +2.20 %)")
     assert _change_text(Difference(0.01, -0.00123456, 0.0234561, 0.95, False, True, 0.9), "s") == (
         "+0.01 (-0.00124 to +0.02346) s")
 

@@ -6,6 +6,7 @@ everywhere yet, so each room has a ceiling for what is left. A ceiling is lowere
 
 from __future__ import annotations
 
+import ast
 import re
 import unicodedata
 from functools import cache
@@ -33,6 +34,16 @@ def test_no_room_gets_less_plain(counts):
     """A new text follows the rules; `python -m tests.packaging.language ROOM` lists what a room has."""
     above = {key: (number, CEILINGS.get(key, 0)) for key, number in counts.items() if number > CEILINGS.get(key, 0)}
     assert above == {}
+
+
+@pytest.mark.parametrize("room", ["tdhil", "drivers", "sim_bus", "profiles"])
+def test_a_percentage_has_a_space_before_its_sign(room):
+    """As the SI brochure (5.4.7) writes it. The format ``{share:.1%}`` prints none; ``{100 * share:.1f} %`` does."""
+    for path in sorted((ROOT / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FormattedValue) and isinstance(node.format_spec, ast.JoinedStr):
+                spec = "".join(str(part.value) for part in node.format_spec.values if isinstance(part, ast.Constant))
+                assert not spec.endswith("%"), f"{path.relative_to(ROOT)}:{node.lineno}"
 
 
 def test_the_ceilings_are_of_rooms_that_exist():

@@ -80,7 +80,7 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     if opinions and before and reference is not None and reference.finite and reference.value > 0.0:
         shown = [(stage, _least_scale_change(found[0], len(group), reference, confidence))
                  for stage, group, found in (("5", against, before), ("2", run_up, run_up)) if found]
-        words = ", ".join(f"of ±{least:.0%} or more at stage {stage}" for stage, least in shown)
+        words = ", ".join(f"of ±{100 * least:.0f} % or more at stage {stage}" for stage, least in shown)
         opinions = (replace(
             opinions[0], note=f"{opinions[0].note}; detects a change of scale {words}",
             least_scale_change=max(least for _, least in shown)), *opinions[1:])
@@ -89,8 +89,8 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
         # no momentum balance can be compared with J
         hidden = least_torque_scale_change(case.recording, case.samples)
         what = ("a change in the scale of torque or speed" if hidden is None else
-                f"a change of less than {hidden:.0%} in the scale of torque or speed after stage 2, or any change "
-                "within it")
+                f"a change of less than {100 * hidden:.0f} % in the scale of torque or speed after stage 2, or any "
+                "change within it")
         warnings = (*warnings, CodedText(
             f"this run does not show {what}. If a scale changed, J has an error of that size",
             MessageCode.SCALE_CHANGE_HIDDEN))

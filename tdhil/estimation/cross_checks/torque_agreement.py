@@ -275,8 +275,8 @@ def torques_judged(case: Case) -> Case:
     widened = replace(
         case.recording, torque_scale_rel_sd=math.hypot(scale, abs(worst.ratio.value - 1.0) / normal_quantile(0.95)))
     warning = (
-        CodedText(f"{_sentence(worst)}; the uncertainty of the torque scale was widened from {scale:.2%} to "
-        f"{widened.torque_scale_rel_sd:.2%} (1 sd)",
+        CodedText(f"{_sentence(worst)}; the uncertainty of the torque scale was widened from {100 * scale:.2f} % to "
+        f"{100 * widened.torque_scale_rel_sd:.2f} % (1 sd)",
         MessageCode.TORQUE_SIGNALS_DIFFER)
     )
     return replace(case, recording=widened, warnings=(*case.warnings, warning))

@@ -73,19 +73,19 @@ def check_signals(recording: Recording, samples: Samples) -> None:
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
     if flagged > _LIMIT_SHARE:
-        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the record", advice,
+        raise Refused(f"the drive was at an internal limit for {100 * flagged:.1f} % of the record", advice,
                       entry=MessageCode.SIGNAL_CLIPPED)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
         at_limit = float(np.mean(np.abs(torque + recording.torque_offset_nm) >= _AT_LIMIT * limit))
         if at_limit > _LIMIT_SHARE:
-            raise Refused(f"the torque was at its limit of {limit:g} N·m for {at_limit:.1%} of the record", advice,
-                          entry=MessageCode.SIGNAL_CLIPPED)
+            raise Refused(f"the torque was at its limit of {limit:g} N·m for {100 * at_limit:.1f} % of the record",
+                          advice, entry=MessageCode.SIGNAL_CLIPPED)
     for name, signal, quantum in (("torque", torque, recording.torque_resolution_nm),
                                   ("speed", speed, recording.speed_resolution_rad_s)):
         share = cut_off(signal, quantum)
         if share is not None:
-            raise Refused(f"the {name} is cut off flat for {share:.1%} of the record", advice,
+            raise Refused(f"the {name} is cut off flat for {100 * share:.1f} % of the record", advice,
                           entry=MessageCode.SIGNAL_CLIPPED)
 
 

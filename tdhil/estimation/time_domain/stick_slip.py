@@ -45,7 +45,7 @@ def refuse_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: fl
         return
     raise Refused(
         f"stick-slip: the shaft stopped {seen.jumps} times while the torque rose by {seen.rise_nm:.3g} N·m, and "
-        f"then jumped. It was at standstill for {seen.still:.0%} of the record",
+        f"then jumped. It was at standstill for {100 * seen.still:.0f} % of the record",
         "turn faster, so that the shaft never stops, or use a stiffer speed loop",
         entry=MessageCode.STICK_SLIP_RECORDED,
     )

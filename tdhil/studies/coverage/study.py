@@ -192,7 +192,7 @@ def draw_coverage(figure: Figure, found: Sequence[PlantFigures], nominal: float)
     left.axvline(100.0 * nominal, color=_LIMIT, linestyle="--", linewidth=1.0)
     left.axvspan(40.0 * nominal, 100.0 * nominal, color="#e8eef5", zorder=0)
     left.set_xlim(0.0, min(100.0, 105.0 * highest))
-    tidy(left, "intervals that miss the truth, % (99 % bounds)", "", f"Miss rate; nominal {nominal:.0%}")
+    tidy(left, "intervals that miss the truth, % (99 % bounds)", "", f"Miss rate; nominal {100 * nominal:.0f} %")
     highest = 1.5
     for row, one in enumerate(found):
         if one.over_bound is None:
@@ -298,13 +298,13 @@ def _said_of(one: PlantFigures, nominal: float) -> list[Statement]:
         )
         statements.append(
             Statement(
-                f"{name}: runs refused though the model is the truth", f"≤ {MOST_REFUSED:.0%} (lower 99 % bound)",
-                f"{one.refused} of {one.runs}", answers(one),
+                f"{name}: runs refused though the model is the truth",
+                f"≤ {100 * MOST_REFUSED:.0f} % (lower 99 % bound)", f"{one.refused} of {one.runs}", answers(one),
             )
         )
     bias = "no run gave a number"
     if one.bias is not None and one.bias_error is not None:
-        bias = f"{one.bias:+.3%} ± {one.bias_error:.3%}"
+        bias = f"{100 * one.bias:+.3f} % ± {100 * one.bias_error:.3f} %"
     statements.append(
         Statement(f"{name}: |bias|", "≤ max(0.2 %, 3 Monte-Carlo standard errors)", bias, unbiased(one))
     )

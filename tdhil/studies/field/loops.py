@@ -251,8 +251,8 @@ def _statements(
         Statement(
             "P and I change the fitted slope, and with it the inertia identified",
             "'distinct slopes'; no figures",
-            f"{slopes.min():.1f} to {slopes.max():.1f} kg·m² at {tone}, {spread / float(np.mean(slopes)):.1%} apart "
-            f"(repeats: sd {chance:.2f}); from 0.1 to 1 Hz the tone alone makes 72 %",
+            f"{slopes.min():.1f} to {slopes.max():.1f} kg·m² at {tone}, {100 * spread / float(np.mean(slopes)):.1f} % "
+            f"apart (repeats: sd {chance:.2f}); from 0.1 to 1 Hz the tone alone makes 72 %",
             verdict,
         ),
         Statement(

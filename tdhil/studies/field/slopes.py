@@ -97,10 +97,10 @@ def alone_statements(found: Sequence[Alone], true_inertia: float) -> list[Statem
             f"{sum(refused)} of {len(found)} refused", all(refused),
         ),
         Statement(
-            f"each tone alone, the joint fit's lags stated: one inertia, within {SPREAD:.0%}",
+            f"each tone alone, the joint fit's lags stated: one inertia, within {100 * SPREAD:.0f} %",
             "76 % from the lowest tone to the highest",
-            f"{', '.join(f'{value:.2f}' for value in values)} kg·m²: {spread:.2%} apart; {covered} of {len(found)} "
-            "intervals cover the rig's",
+            f"{', '.join(f'{value:.2f}' for value in values)} kg·m²: {100 * spread:.2f} % apart; "
+            f"{covered} of {len(found)} intervals cover the rig's",
             len(inertias) == len(found) and spread <= SPREAD and covered == len(found),
         ),
     ]
@@ -145,7 +145,7 @@ def said_of_slopes(
     for record in records:
         ours, published = record.points.fit.inertia_kg_m2, record.published[0]
         if published is not None:
-            text = f"the paper's method gives the published slope at {record.hertz:g} Hz, within {CLOSE:.0%}"
+            text = f"the paper's method gives the published slope at {record.hertz:g} Hz, within {100 * CLOSE:.0f} %"
             found.append(Statement(
                 text, f"{published:g} kg·m²", f"{ours:.3f} kg·m² ({percent(ours, published):+.2f} %)",
                 abs(ours / published - 1.0) <= CLOSE,
@@ -153,8 +153,8 @@ def said_of_slopes(
     ordered = [record.points.fit.inertia_kg_m2 for record in sorted(records, key=lambda record: record.hertz)]
     growth = ordered[-1] / ordered[0] - 1.0
     found.append(Statement(
-        "the fitted slope grows with the tone", "by 76 % from 0.1 to 1 Hz, on one rig", f"by {growth:.0%}, on one rig",
-        bool(np.all(np.diff(ordered) > 0.0)),
+        "the fitted slope grows with the tone", "by 76 % from 0.1 to 1 Hz, on one rig",
+        f"by {100 * growth:.0f} %, on one rig", bool(np.all(np.diff(ordered) > 0.0)),
     ))
     true, one_inertia = settings.rig.inertia_kg_m2, joint.inertia
     text = "one inertia behind all records: the joint fit's interval covers the rig's"
@@ -169,8 +169,8 @@ def said_of_slopes(
         Statement(
             "one line, with that inertia and the reporting lags, passes through all slopes",
             "J 103.75, lags 0.403 and 0.151 s: 0.10 kg·m² RMS from the four",
-            f"within {off:.1%} of ours, lags {_value(joint.speed_lag_s)} and {_value(joint.torque_lag_s)} s; noise in "
-            f"α takes up to {noise:.1%} more off the fitted slopes",
+            f"within {100 * off:.1f} % of ours, lags {_value(joint.speed_lag_s)} and {_value(joint.torque_lag_s)} s; "
+            f"noise in α takes up to {100 * noise:.1f} % more off the fitted slopes",
             off <= CURVE_CLOSE,
         ),
         *_open(records),
