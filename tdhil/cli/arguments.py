@@ -40,21 +40,13 @@ share = amount(SHARE)
 
 
 _LEAST_ALIKE = 0.78
-"""Least similarity (`difflib`, 0 to 1) of a suggested name. ``--nodes`` has 0.92 with ``--node``; ``--duration`` has
-0.67 with ``--realisations``, and ``--baudrate`` 0.75 with ``--rate``: the user did not mean these."""
-_OTHER_WORDS: Final = {
-    "--duration": "--max-time", "--output": "--log", "--out": "--log", "--ip": "--host", "--baudrate": "--bitrate",
-}
-"""Options of other tools, and ours with the same meaning."""
+"""Least similarity (`difflib`, 0 to 1) of a suggested name. A mistyped name has 0.9 and more; another word that only
+looks alike has up to 0.75, and the user did not mean it."""
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """Return the suggestion "Did you mean 'NAME'? " for a known name that is similar or means the same, or an empty
-    text.
-    """
-    names = list(known)
-    other = [one for one in (_OTHER_WORDS.get(name),) if one in names]
-    close = other or difflib.get_close_matches(name[:40], names, n=1, cutoff=_LEAST_ALIKE)
+    """Return the suggestion "Did you mean 'NAME'? " for a similar known name, or an empty text."""
+    close = difflib.get_close_matches(name[:40], list(known), n=1, cutoff=_LEAST_ALIKE)
     return f"Did you mean '{close[0]}'? " if close else ""
 
 
