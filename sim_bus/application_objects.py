@@ -165,6 +165,7 @@ class ApplicationObjects:
         store.set_default(0x6076, 0, rated_torque_counts(drive.rated_torque_nm, self._units.rated_torque))
         store.set_default(0x6072, 0, torque)
         store.set_default(0x6080, 0, speed)
+        store.set_default(0x606F, 0, round(application.settings.standstill_rad_s / self._usual.velocity))
         store.variable(0x6072, 0).max = torque
         store.variable(0x6080, 0).max = speed
         self._bind_process_data()

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from math import inf
 
-from sim_bus.inverter import Inverter
+from sim_bus.inverter import RPM, Inverter
 
 # ---------------------------------------------------------------------------------------------------------------------
 # CiA 402-2 power drive system state machine, drive side: states, commands, transitions. Pure.
@@ -57,6 +57,10 @@ those of a sine do not."""
 
 TURNING_SHARE = 0.05
 """Share of the speed limit above which a shaft counts as turning, for a scripted stop. A sign probe stays below."""
+
+STANDSTILL_RAD_S, STANDSTILL_SHARE = 0.05, 0.0015
+"""Velocity threshold (606Fh) as delivered: rad/s, or a share of the speed limit if that is more. The speed of a fast
+drive is noisier: at 3000 1/min the threshold is 4.5 1/min."""
 
 
 class State(Enum):
@@ -166,7 +170,7 @@ class ApplicationSettings:
     torque_slope_nm_s: float = 100.0     # 6087h
     window_rad_s: float = 0.1            # 606Dh
     window_s: float = 0.0                # 606Eh
-    standstill_rad_s: float = 0.05       # 606Fh
+    standstill_rad_s: float = STANDSTILL_RAD_S   # 606Fh
     standstill_s: float = 0.1            # 6070h
     torque_quick_stop: bool = True       # True: a quick stop on command decelerates from a torque mode
 
@@ -180,7 +184,10 @@ class Application:
 
     def __init__(self, inverter: Inverter) -> None:
         self.inverter = inverter
-        self.settings = ApplicationSettings(quick_stop_rad_s2=inverter.params.drive.quick_stop_rad_s2)
+        drive = inverter.params.drive
+        self.settings = ApplicationSettings(
+            quick_stop_rad_s2=drive.quick_stop_rad_s2,
+            standstill_rad_s=max(STANDSTILL_RAD_S, STANDSTILL_SHARE * drive.speed_limit_rpm * RPM))
         self.state = State.SWITCH_ON_DISABLED
         self.mode = OperationMode.PROFILE_VELOCITY
         self.controlword = 0

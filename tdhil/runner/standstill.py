@@ -75,12 +75,19 @@ class Standstill:
         self._longest_gap_s = longest_gap_s
         self._since_s: float | None = None
         self._heard_s = 0.0
+        self._shown = False
         self._noise = CountsOfNoise(observer, at_rest_rad_s)
 
     @property
     def settle_s(self) -> float:
         """Return the time for which standstill must be reported, s; longer if the motion was never reported."""
         return max(self._settle_s, self._observer.blind_s, self._observer.unseen_s)
+
+    @property
+    def denied(self) -> bool:
+        """Return whether speed and position have shown standstill for long enough, but the drive's state has not."""
+        since_s = self._since_s
+        return since_s is not None and not self._shown and self._heard_s - since_s >= self.settle_s
 
     def quiet(self, sample: Sample) -> bool:
         """Return whether speed and position are zero in this sample, and may be believed."""
@@ -109,5 +116,5 @@ class Standstill:
             self._since_s = sample.time_s
             self._noise.restart()
             return False
-        shown = without_torque or sample.standstill or sample.state in NO_TORQUE
-        return shown and sample.time_s - self._since_s >= self.settle_s and observer.coasts_s <= 0.0
+        self._shown = without_torque or sample.standstill or sample.state in NO_TORQUE
+        return self._shown and sample.time_s - self._since_s >= self.settle_s and observer.coasts_s <= 0.0

@@ -228,6 +228,9 @@ TORQUE_GONE_S = 2.0
 REPEAT_S = 1.0
 """Interval of repeating the quick stop while the drive shows no valid state, s."""
 
+_DENIED = (": the reported speed was zero, but the drive's status did not show standstill. The drive's speed threshold "
+           "of standstill may be below the noise of its speed")
+
 _STOPPING = (PowerState.QUICK_STOP, *NO_TORQUE)
 _REST = Command(Mode.SPEED, 0.0, 0.0)
 _NO_TORQUE_ASKED = Command(Mode.TORQUE, 0.0, 0.0)
@@ -629,6 +632,7 @@ class StopSequence:
         elif patience.waited_s:
             self._trouble.append(
                 f"standstill was not observed within {patience.waited_s:.1f} s of the quick stop"
+                + (_DENIED if rest.denied else "")
             )
         return None
 

@@ -47,6 +47,7 @@ def test_one_witness_of_standstill_is_not_enough(world, what):
     assert not report.confirmed
     assert not report.disabled
     assert "standstill was not observed" in report.trouble[-1]
+    assert ("the reported speed was zero, but the drive's status" in report.trouble[-1]) == (what == "status")
     assert "disable" not in here.drive.calls
     assert here.drive.disabled_at == []
 

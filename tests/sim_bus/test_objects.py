@@ -12,6 +12,7 @@ from profiles import TdhilError
 from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
 from sim_bus.application_objects import rated_torque_counts
 from sim_bus.objects import generic_eds
+from tests.rigs import QUIET_RIG
 
 Open = Callable[..., tuple[Any, Any]]
 
@@ -192,3 +193,11 @@ def test_a_rated_torque_that_6076h_cannot_hold_is_refused_in_words():
     assert rated_torque_counts(4294.0, 1e-6) == 4_294_000_000
     with pytest.raises(TdhilError, match=r"6076h cannot hold the rated torque of 7580 N·m: .* ends at 4295 N·m"):
         rated_torque_counts(7580.0, 1e-6)
+
+
+@pytest.mark.parametrize(("speed_limit_rpm", "tenths_rpm"), [(200.0, 5), (250.0, 5), (3000.0, 45)])
+def test_a_fast_drive_has_a_higher_velocity_threshold(bench: Open, speed_limit_rpm: float, tenths_rpm: int) -> None:
+    """606Fh. The threshold of a slow drive is below the noise of a servo: it would never report standstill."""
+    drive = QUIET_RIG.drive.model_copy(update={"speed_limit_rpm": speed_limit_rpm})
+    _, host = bench(QUIET_RIG.model_copy(update={"drive": drive}))
+    assert host.read(0x606F) == tenths_rpm
