@@ -18,6 +18,7 @@ from tdhil.recording import Recording
 from tdhil.report.acceptance import acceptance_rows, signature_rows
 from tdhil.report.card import (
     COMPLIANT,
+    budget_figures,
     estimate_text,
     in_degrees,
     in_milliradians,
@@ -429,9 +430,8 @@ def _budget(document: Part) -> Table:
     lines = sorted(document["budget"], key=lambda line: -(line["half_width_kg_m2"] or 0.0))
     rows = []
     for line in lines:
-        half = line["half_width_kg_m2"]
-        share = f"{100.0 * half / inertia['value']:.2g}" if half is not None and inertia is not None else ""
-        rows.append((line["source"], "open" if half is None else f"{half:.2g}", share, line["note"]))
+        figures = budget_figures(line["half_width_kg_m2"], None if inertia is None else inertia["value"])
+        rows.append((line["source"], *figures, line["note"]))
     return Table((Column("source", 0.2), Column("± kg·m²", 0.11, True), Column("± %", 0.11, True), Column("", 0.58)),
                  tuple(rows))
 

@@ -85,6 +85,11 @@ def _digits(number: float, half_width: float) -> str:
     return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # avoids −0
 
 
+def two_digits(half_width: float) -> str:
+    """Return a half-width with two significant digits and without an exponent: ``1200``, ``6.4``, ``0.000079``."""
+    return _digits(half_width, half_width) if 0.0 < half_width < math.inf else plain_number(half_width)
+
+
 def percent(half_width: float, value: float) -> str:
     """Return ``±0.80 %`` of the value: two significant digits, rounded up."""
     if not value or not math.isfinite(half_width):
@@ -227,14 +232,18 @@ def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool 
         table.add_column(style="dim", overflow="fold")
     table.add_row(Text(UNCERTAINTY_BUDGET, style="italic"), Text("± kg·m²", style="dim"), Text("± %", style="dim"))
     for line in sorted(budget, key=lambda line: -(line["half_width_kg_m2"] or 0.0)):
-        half, note = line["half_width_kg_m2"], (line["note"],) if notes else ()
-        if half is None:
-            table.add_row(line["source"], "open", "", *note)
-        elif half < _NOTHING * value:
-            table.add_row(line["source"], "0", "0", *note)
-        else:
-            table.add_row(line["source"], f"{half:.2g}", percent(half, value).strip("±% "), *note)
+        note = (line["note"],) if notes else ()
+        table.add_row(line["source"], *budget_figures(line["half_width_kg_m2"], value), *note)
     return table
+
+
+def budget_figures(half_width: float | None, value: float | None) -> tuple[str, str]:
+    """Return a half-width of the budget, and its share of J in %. A contribution below `_NOTHING` is 0."""
+    if half_width is None:
+        return "open", ""
+    if value is not None and half_width < _NOTHING * value:
+        return "0", "0"
+    return two_digits(half_width), percent(half_width, value).strip("±% ") if value else ""
 
 
 def estimate_text(part: Mapping[str, Any], unit: str) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tdhil.recording import FloatArray, Recording
+from tdhil.report.card import budget_figures
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
@@ -150,7 +151,7 @@ def draw_budget(figure: FigureBase, document: Part) -> None:
     halves = [line["half_width_kg_m2"] for line in lines]
     colours = [QUIET if line["source"].startswith("torque scale") else OURS for line in lines]
     bars = axes.barh([line["source"] for line in lines], halves, color=colours)
-    axes.bar_label(bars, [f"{half:.2g}" for half in halves], padding=4, fontsize="small")
+    axes.bar_label(bars, [budget_figures(half, max(halves))[0] for half in halves], padding=4, fontsize="small")
     axes.margins(x=0.12)
     axes.set_xlabel("half-width that it alone leaves, kg·m²")
     axes.grid(axis="x", alpha=0.3)

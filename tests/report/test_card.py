@@ -19,6 +19,7 @@ from tdhil.report.card import (
     plus_minus_part,
     print_card,
     table_cell,
+    two_digits,
     with_interval,
 )
 from tdhil.report.document import result_document
@@ -99,6 +100,11 @@ def test_digits_follow_the_half_width():
     assert plus_minus(5.0, float("inf")) == "5"
     assert with_interval(-0.0003, -0.014, 0.016, "s") == "0.000 (-0.014 to 0.016) s"
     assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±13 %", "±0.034 %"]
+
+
+def test_a_half_width_has_two_digits_and_no_exponent():
+    assert [two_digits(one) for one in (1234.0, 49.4, 6.43, 0.304, 7.9e-5, 0.0)] == [
+        "1200", "49", "6.4", "0.30", "0.000079", "0"]
 
 
 def test_a_cell_of_a_table_rounds_its_interval_outwards_and_writes_no_powers_of_ten():
