@@ -81,6 +81,7 @@ def _dry_run_steps(
         print_json(plain)
         return 0
     from tdhil.report import SIMULATED, PlainConsole
+    from tdhil.runner.stages import MOST_LONGER
 
     console = PlainConsole()
     if simulated:
@@ -89,7 +90,9 @@ def _dry_run_steps(
         f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({in_nm(step_torque_nm)}) "
         f"between {program.low_rad_s:.3g} and {program.high_rad_s:.3g} rad/s, {program.duration_s:.0f} s; limits "
         f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m, "
-        f"{limits.time_s:g} s. A run first measures friction, and then plans again.", soft_wrap=True)
+        f"{limits.time_s:g} s. A run first measures friction, and then plans again. If P or I is not known well enough "
+        f"after these pairs, more follow: at most {MOST_LONGER:g} times as many in total, within the time limit.",
+        soft_wrap=True)
     return 0
 
 

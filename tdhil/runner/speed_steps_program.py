@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 
+from drivers import Command, Mode
 from tdhil.runner.programs import Run, Turning, begin_motion, switch_to_torque, turn
 from tdhil.runner.stages import (
     STEPS_RESERVE_S,
+    SpeedSteps,
+    further_pairs,
     go_to,
     plan_steps,
     plan_steps_before,
     refuse_other_shaft,
-    run_steps,
 )
-from tdhil.speed_loop import StepCase, StepProgram
+from tdhil.speed_loop import StepCase, StepProgram, StepRecord, StepVerification, verify_record
 
 
 def speed_steps(run: Run, case: StepCase) -> None:
@@ -49,13 +52,38 @@ def hold_low_speed(run: Run, case: StepCase, turning: Turning) -> StepProgram:
 
 
 def acquire_steps(run: Run, case: StepCase, program: StepProgram, turning: Turning) -> None:
-    """Run stage 5: the steps. Their times go into the log."""
+    """Run stage 5: the steps, and more of them if P or I is not known well enough. Their times go into the log."""
+    loop, speed = run.loop, turning.speed.high
 
-    def keep(starts: list[float]) -> None:
+    def keep(program: StepProgram) -> None:
         run.log.configure(verification={
-            "case": case.plain(), "program": asdict(program), "starts_s": list(starts),
+            "case": case.plain(), "program": asdict(program), "starts_s": list(steps.starts_s),
             "reference_filter_s": run.task.request.reference_filter_s,
         })
 
     with run.book.stage("acquire", program.duration_s):
-        run_steps(run.loop, case, program, run.speed_resolution_rad_s, turning.speed.high.speed_sd_rad_s, keep)
+        steps = SpeedSteps(loop, case, program, run.speed_resolution_rad_s, speed.speed_sd_rad_s)
+        for number in range(program.pairs + 1):
+            steps.run_pair(number)
+            keep(program)
+        found = _found_so_far(run, case, program, steps.starts_s)
+        more = further_pairs(found, program, loop.guard.left_s(loop.now_s) - STEPS_RESERVE_S)
+        if more:
+            text = f"{found.reason}. {more} more pairs follow, {2.0 * program.half_s * (more + 1):.0f} s"
+            run.log.event(loop.now_s, "plan", text)
+            run.say(text)
+            steps.run_pair(0, counts=False)        # it does not begin like the others: the speed was held before it
+        longer = replace(program, pairs=program.pairs + more)
+        for number in range(program.pairs + 1, longer.pairs + 1):
+            steps.run_pair(number)
+            keep(longer)
+
+
+def _found_so_far(run: Run, case: StepCase, program: StepProgram, starts_s: list[float]) -> StepVerification:
+    """Compare the steps so far, while the shaft turns at the lower speed."""
+    recording = run.log.recording(complete=True)
+    record = StepRecord(
+        recording.time_s, recording.speed_rad_s, recording.fresh, recording.limited, tuple(starts_s),
+        run.loop.period_s, recording.timing_half_width_s, run.task.request.reference_filter_s)
+    command = Command(Mode.SPEED, program.low_rad_s, 0.0)
+    return run.loop.compute(partial(verify_record, case, program, record), command)

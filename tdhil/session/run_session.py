@@ -334,6 +334,6 @@ def load_what_the_end_needs(report: bool, case: bool) -> None:
         from tdhil.report import draw_run, require_extra  # noqa: F401
     if case:
         from tdhil.report import evaluation_document, verification_document  # noqa: F401
-        from tdhil.speed_loop import verify_steps  # noqa: F401
+        from tdhil.speed_loop import verify_record  # noqa: F401
     if case and report:
         from tdhil.report import evaluation_report, verification_report  # noqa: F401

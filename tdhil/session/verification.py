@@ -66,10 +66,8 @@ def is_verification(run: Mapping[str, Any]) -> bool:
 
 def conclude_verification(recording: Recording, run: Mapping[str, Any], log: str) -> VerificationConclusion:
     """Compare from the log alone, the same live and in replay. Raises LogError if the log lacks data."""
-    import numpy as np
-
     from tdhil.report import verification_document
-    from tdhil.speed_loop import StepOutcome, StepProgram, step_case_of, step_pairs, verify_steps
+    from tdhil.speed_loop import StepOutcome, StepProgram, StepRecord, step_case_of, verify_record
 
     try:
         said = run[VERIFICATION]
@@ -80,14 +78,9 @@ def conclude_verification(recording: Recording, run: Mapping[str, Any], log: str
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"contains no readable steps of the set speed ({error})", where=log,
                        next_step="Repeat the run") from None
-    fresh, time_s = recording.fresh, recording.time_s
-    # A half that the end of the run cut short is left out.
-    whole = [start for start in starts if time_s.size and start + program.half_s <= time_s[-1] + 0.5 * period_s]
-    begin, end = (whole[0], whole[-1] + program.half_s) if whole else (np.inf, np.inf)
-    limited = bool(np.any(recording.limited[(time_s >= begin) & (time_s <= end)]))
-    pairs = step_pairs(time_s[fresh], recording.speed_rad_s[fresh], whole, program, period_s)
-    found = verify_steps(case, pairs, program, period_s, limited=limited, timing_sd_s=recording.timing_half_width_s,
-                         reference_filter_s=filter_s)
+    found = verify_record(case, program, StepRecord(
+        recording.time_s, recording.speed_rad_s, recording.fresh, recording.limited, starts, period_s,
+        recording.timing_half_width_s, filter_s))
     document = verification_document(found, case, program, recording, run, log)
     codes = {StepOutcome.AGREES: ExitCode.OK, StepOutcome.DIFFERS: ExitCode.NOT_PASSED,
              StepOutcome.CANNOT_TELL: ExitCode.NOT_IDENTIFIABLE}

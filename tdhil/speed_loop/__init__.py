@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     )
     from tdhil.speed_loop.verification import (
         LEAST_PAIRS as LEAST_PAIRS, StepCase as StepCase, StepOutcome as StepOutcome, StepProgram as StepProgram,
-        StepRow as StepRow, StepVerification as StepVerification, step_case_of as step_case_of,
-        step_length_s as step_length_s, step_pairs as step_pairs, verify_steps as verify_steps,
+        StepRecord as StepRecord, StepRow as StepRow, StepVerification as StepVerification,
+        step_case_of as step_case_of, step_length_s as step_length_s, step_pairs as step_pairs,
+        verify_record as verify_record, verify_steps as verify_steps,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
@@ -34,6 +35,6 @@ else:
         "step": "StepFigures is_stable_loop step_figures step_responses",
         "design": "LoopDesign LoopRow LoopTuningRefused Range SpeedLoopCase UncertainPlant design_speed_loop",
         "preview": "LoopCurve MeasuredShaft deviation_from_model loop_at_lines loop_curve measured_shaft",
-        "verification": "LEAST_PAIRS StepCase StepOutcome StepProgram StepRow StepVerification step_case_of "
-                        "step_length_s step_pairs verify_steps",
+        "verification": "LEAST_PAIRS StepCase StepOutcome StepProgram StepRecord StepRow StepVerification "
+                        "step_case_of step_length_s step_pairs verify_record verify_steps",
     })

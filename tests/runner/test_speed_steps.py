@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from drivers.drive import Mode
@@ -11,10 +12,11 @@ from drivers.errors import DriveFault, LimitHit, PreflightRefused
 from tdhil.errors import Interrupted
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest
-from tdhil.runner.stages import plan_steps
+from tdhil.runner.stages import further_pairs, plan_steps
 from tdhil.runner.task import Task
-from tdhil.speed_loop import PiGains, Range, StepCase, UncertainPlant
+from tdhil.speed_loop import PiGains, Range, StepCase, StepOutcome, StepProgram, StepVerification, UncertainPlant
 from tests.runner.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, FakeDrive
+from tests.runner.line_drive import BuilderLog
 from tests.runner.run_outcomes import assert_at_rest, outcomes, up_to
 
 PLANT = UncertainPlant(Range(100.0, 96.0, 104.0), Range(8.0, 7.0, 9.0), (Range(0.02, 0.018, 0.022),),
@@ -23,9 +25,9 @@ CASE = StepCase("tuned", PLANT, PiGains(500.0, 600.0), Range(0.2, 0.15, 0.25), R
                 Range(0.4, 0.35, 0.45), Range(0.0, 0.0, 0.02), "tune.json")
 
 
-def runner(here, case=CASE, limits=LIMITS):
+def runner(here, case=CASE, limits=LIMITS, log=None):
     task = Task(limits, ExcitationRequest(mode="speed"), {}, case=case)
-    return Runner(here.drive, lambda _: task, here.log, here.stop_request, here.display, lambda *_: None)
+    return Runner(here.drive, lambda _: task, log or BuilderLog(), here.stop_request, here.display, lambda *_: None)
 
 
 def in_acquire(here, cycle, what):
@@ -49,6 +51,33 @@ def test_the_steps_stay_within_the_limits_and_end_at_rest(world):
 def test_steps_that_settle_fast_are_repeated_more_often(settling_s, pairs):
     case = replace(CASE, settling_s=Range(settling_s, settling_s, settling_s), reported_lag_s=Range(0.07, 0.07, 0.07))
     assert plan_steps(case, LIMITS, PERIOD_S, SPEED_RESOLUTION, 800.0).pairs == pairs
+
+
+def outcome(needed_pairs):
+    nothing = np.zeros(0)
+    return StepVerification(StepOutcome.CANNOT_TELL, "I is known from 0.8 to 1.4 times the typed value", (), 24, 0.0,
+                            1.0, nothing, nothing, nothing, nothing, needed_pairs)
+
+
+@pytest.mark.parametrize(("needed_pairs", "left_s", "more"), [
+    (None, 800.0, 0), (30, 800.0, 6), (60, 800.0, 36), (100, 800.0, 36), (113, 800.0, 0), (30, 70.0, 6),
+    (30, 69.0, 0),
+])
+def test_more_pairs_follow_where_they_are_enough_and_the_time_is_left(needed_pairs, left_s, more):
+    assert further_pairs(outcome(needed_pairs), StepProgram(4.0, 4.5, 5.0, 24), left_s) == more
+
+
+def test_further_pairs_are_run_and_logged_after_one_that_does_not_count(world, monkeypatch):
+    monkeypatch.setattr("tdhil.runner.speed_steps_program.verify_record", lambda *_: outcome(64))
+    here, log = world(FakeDrive(), LIMITS), BuilderLog()
+    result = runner(here, log=log).run()
+    assert result.cause is None
+    said = log.run["verification"]
+    program = said["program"]
+    assert program["pairs"] == 64 and len(said["starts_s"]) == 2 * (64 + 1)
+    gaps = np.diff(said["starts_s"]) / program["half_s"]
+    assert np.count_nonzero(gaps > 1.5) == 1 and np.max(gaps) == pytest.approx(3.0, abs=0.1)
+    assert any("more pairs follow" in text for _, text in log.events)
 
 
 @pytest.mark.parametrize(("limits", "said"), [

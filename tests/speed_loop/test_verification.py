@@ -15,11 +15,13 @@ from tdhil.speed_loop import (
     StepCase,
     StepOutcome,
     StepProgram,
+    StepRecord,
     UncertainPlant,
     design_speed_loop,
     step_case_of,
     step_length_s,
     step_pairs,
+    verify_record,
     verify_steps,
 )
 from tests.speed_loop.by_control import step as by_control
@@ -32,6 +34,7 @@ CASE = StepCase("tuned", PLANT, ROW.gains, ROW.overshoot_share, ROW.rise_s, ROW.
                 "tune.json")
 PROGRAM = StepProgram(4.0, 4.2, round(step_length_s(CASE) / PERIOD_S) * PERIOD_S, 16)
 COUNTS = 10
+NOISY = 0.1     # standard deviation of a step, as a share of it: 16 pairs are too few
 ROUNDED = replace(PROGRAM, dither_rad_s=(PROGRAM.high_rad_s - PROGRAM.low_rad_s) / COUNTS)
 PARAMETERS = pytest.mark.parametrize(("proportional", "integral"), [(1.3, 1.0), (0.7, 0.7)])
 
@@ -150,6 +153,38 @@ def test_the_case_comes_back_from_the_log():
     assert step_case_of(json.loads(json.dumps(CASE.plain()))) == CASE
     with pytest.raises((KeyError, TypeError)):
         step_case_of({"plant": {}})
+
+
+def test_too_few_pairs_state_how_many_are_needed_and_these_are_enough():
+    wide = found(responses(CASE.gains, noise=NOISY))
+    assert wide.outcome is StepOutcome.CANNOT_TELL and wide.needed_pairs is not None
+    assert 1.25 * PROGRAM.pairs <= wide.needed_pairs < 4 * PROGRAM.pairs
+    rng = np.random.default_rng(7)
+    one = responses(CASE.gains, noise=0.0)[0]
+    more = one + NOISY * rng.standard_normal((wide.needed_pairs, len(one))) / np.sqrt(2.0)
+    enough = found(more, replace(PROGRAM, pairs=wide.needed_pairs))
+    assert enough.outcome is StepOutcome.AGREES and enough.needed_pairs is None
+
+
+def test_no_number_of_pairs_helps_where_a_limit_acted():
+    assert found(responses(CASE.gains, noise=NOISY), limited=True).needed_pairs is None
+
+
+def test_a_record_gives_the_pairs_of_its_whole_steps():
+    program = replace(PROGRAM, pairs=9)
+    time_s = PERIOD_S * np.arange(round(program.duration_s / PERIOD_S) + 1)
+    halves = np.minimum(np.floor(time_s / program.half_s + 1e-9).astype(int), 2 * program.pairs + 1)
+    speed = np.where(halves % 2 == 0, program.high_rad_s, program.low_rad_s)
+    starts = [program.half_s * k for k in range(2 * (program.pairs + 1))]
+    limited = time_s < 0.0
+    record = StepRecord(time_s, speed, ~limited, limited, starts, PERIOD_S)
+    assert verify_record(CASE, program, record).pairs == program.pairs
+    at_end = replace(record, time_s=time_s[:-1], speed_rad_s=speed[:-1], fresh=~limited[:-1], limited=limited[:-1])
+    assert verify_record(CASE, program, at_end).pairs == program.pairs     # as the run sees it after its last step
+    short = replace(record, time_s=time_s[:-9], speed_rad_s=speed[:-9], fresh=~limited[:-9], limited=limited[:-9])
+    assert verify_record(CASE, program, short).pairs == program.pairs - 1
+    acted = verify_record(CASE, program, replace(record, limited=time_s > 5.0))
+    assert acted.reason == "an internal limit of the drive acted during the steps"
 
 
 def test_pairs_are_free_of_offset_and_drift_and_the_first_is_dropped():

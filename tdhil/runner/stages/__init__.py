@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from tdhil.runner.stages.setup import measure_torque_offset as measure_torque_offset, probe_sign as probe_sign
     from tdhil.runner.stages.speed import RampCourse as RampCourse, SpeedResult as SpeedResult, run_speed as run_speed
     from tdhil.runner.stages.speed_steps import (
-        STEPS_RESERVE_S as STEPS_RESERVE_S, plan_steps as plan_steps, plan_steps_before as plan_steps_before,
-        refuse_other_shaft as refuse_other_shaft, run_steps as run_steps,
+        MOST_LONGER as MOST_LONGER, STEPS_RESERVE_S as STEPS_RESERVE_S, SpeedSteps as SpeedSteps,
+        further_pairs as further_pairs, plan_steps as plan_steps, plan_steps_before as plan_steps_before,
+        refuse_other_shaft as refuse_other_shaft,
     )
     from tdhil.runner.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque
     from tdhil.runner.stages.virtual_string import (
@@ -31,7 +32,8 @@ else:
         "set_speed": "go_to",
         "setup": "measure_torque_offset probe_sign",
         "speed": "RampCourse SpeedResult run_speed",
-        "speed_steps": "STEPS_RESERVE_S plan_steps plan_steps_before refuse_other_shaft run_steps",
+        "speed_steps": "MOST_LONGER STEPS_RESERVE_S SpeedSteps further_pairs plan_steps plan_steps_before "
+                       "refuse_other_shaft",
         "torque": "TorqueResult run_torque",
         "virtual_string": "course_of refuse_other_rig run_virtual_string",
     })

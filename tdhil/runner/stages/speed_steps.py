@@ -7,17 +7,18 @@ run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from drivers import Command, LimitHit, Mode, PreflightRefused
 from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import MachineLimits
-from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, step_length_s
+from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, StepVerification, step_length_s
 
 FEWEST_PAIRS, MOST_PAIRS, PAIRS_S = 24, 60, 160.0
 """Number of evaluated pairs of steps, and their time, s. Fast loops have smaller steps and need more pairs."""
+MOST_LONGER, HOPELESS = 2.5, 4.7
+"""Largest number of pairs if the intervals of P and I are still too wide, as a multiple of the planned one; and the
+needed multiple above which even that number would not do: the half-width of ln P or ln I would stay above 0.22."""
 TORQUE_SHARE = 0.45
 """Share of the torque between friction and limit that a step uses; noise and overshoot need the rest."""
 SPEED_SHARE = 0.25
@@ -88,24 +89,42 @@ def _refused(what: str, where: str, next_step: str) -> PreflightRefused:
     return PreflightRefused(what, where=where, next_step=next_step, entry=MessageCode.VERIFICATION_REFUSED)
 
 
-def run_steps(
-    loop: ControlLoop, case: StepCase, program: StepProgram, resolution_rad_s: float, noise_rad_s: float,
-    keep: Callable[[list[float]], None],
-) -> None:
-    """Run all steps, from steady rotation at the lower speed; ``keep`` receives the times of the halves so far.
+def further_pairs(found: StepVerification, program: StepProgram, left_s: float) -> int:
+    """Return the number of further pairs from which P and I may be known well enough; 0 if they are, or if none helps.
 
-    ``noise_rad_s``: standard deviation of the reported speed. Raises LimitHit, and what the bench raises.
+    ``left_s``: time that is left for them, and for one more pair that does not count.
     """
-    starts: list[float] = []
-    allowed = (OVERSHOOTS * case.overshoot_share.high + OVERSHOOT_SHARE) * program.step_rad_s + max(
-        STRANGE_COUNTS * resolution_rad_s, STRANGE_SDS * noise_rad_s)
-    cycles = loop.cycles(program.half_s)
-    for pair in range(program.pairs + 1):
-        for speed in program.speeds_rad_s(pair):
-            for at in range(cycles):
-                sample = loop.cycle(Command(Mode.SPEED, speed, 0.0))
-                if at == 0:
-                    starts.append(sample.time_s)
+    needed = found.needed_pairs
+    if needed is None or needed > HOPELESS * program.pairs:
+        return 0
+    more = min(needed, int(MOST_LONGER * program.pairs)) - program.pairs
+    return more if 2.0 * program.half_s * (more + 1) <= left_s else 0
+
+
+class SpeedSteps:
+    """Steps of stage 5, pair by pair, from steady rotation at the lower speed. ``starts_s``: of all steps that count.
+
+    ``noise_rad_s``: standard deviation of the reported speed.
+    """
+
+    def __init__(
+        self, loop: ControlLoop, case: StepCase, program: StepProgram, resolution_rad_s: float, noise_rad_s: float
+    ) -> None:
+        self.starts_s: list[float] = []
+        self._loop = loop
+        self._program = program
+        self._cycles = loop.cycles(program.half_s)
+        self._allowed = (OVERSHOOTS * case.overshoot_share.high + OVERSHOOT_SHARE) * program.step_rad_s + max(
+            STRANGE_COUNTS * resolution_rad_s, STRANGE_SDS * noise_rad_s)
+
+    def run_pair(self, number: int, *, counts: bool = True) -> None:
+        """Run a step up and the step down. Raises LimitHit if the speed overshoots, and what the bench raises."""
+        program, allowed = self._program, self._allowed
+        for speed in program.speeds_rad_s(number):
+            for at in range(self._cycles):
+                sample = self._loop.cycle(Command(Mode.SPEED, speed, 0.0))
+                if at == 0 and counts:
+                    self.starts_s.append(sample.time_s)
                 if not program.low_rad_s - allowed <= sample.speed_rad_s <= program.high_rad_s + allowed:
                     raise LimitHit(
                         f"speed {sample.speed_rad_s:.3f} rad/s after a step from {program.low_rad_s:.3f} to"
@@ -114,4 +133,3 @@ def run_steps(
                         next_step="The shaft was stopped. Compare the gains in the drive with the tuned ones, and lower"
                         " P",
                         entry=MessageCode.STEP_OVERSHOOTS)
-        keep(starts)
