@@ -22,11 +22,13 @@ if TYPE_CHECKING:
         LoopCurve as LoopCurve, MeasuredShaft as MeasuredShaft, deviation_from_model as deviation_from_model,
         loop_at_lines as loop_at_lines, loop_curve as loop_curve, measured_shaft as measured_shaft,
     )
+    from tdhil.speed_loop.step_model import (
+        StepCase as StepCase, StepProgram as StepProgram, step_case_of as step_case_of, step_length_s as step_length_s,
+    )
     from tdhil.speed_loop.verification import (
-        LEAST_PAIRS as LEAST_PAIRS, StepCase as StepCase, StepOutcome as StepOutcome, StepProgram as StepProgram,
-        StepRecord as StepRecord, StepRow as StepRow, StepVerification as StepVerification,
-        step_case_of as step_case_of, step_length_s as step_length_s, step_pairs as step_pairs,
-        verify_record as verify_record, verify_steps as verify_steps,
+        LEAST_PAIRS as LEAST_PAIRS, StepOutcome as StepOutcome, StepRecord as StepRecord, StepRow as StepRow,
+        StepVerification as StepVerification, step_pairs as step_pairs, verify_record as verify_record,
+        verify_steps as verify_steps,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
@@ -35,6 +37,7 @@ else:
         "step": "StepFigures is_stable_loop step_figures step_responses",
         "design": "LoopDesign LoopRow LoopTuningRefused Range SpeedLoopCase UncertainPlant design_speed_loop",
         "preview": "LoopCurve MeasuredShaft deviation_from_model loop_at_lines loop_curve measured_shaft",
-        "verification": "LEAST_PAIRS StepCase StepOutcome StepProgram StepRecord StepRow StepVerification "
-                        "step_case_of step_length_s step_pairs verify_record verify_steps",
+        "step_model": "StepCase StepProgram step_case_of step_length_s",
+        "verification": "LEAST_PAIRS StepOutcome StepRecord StepRow StepVerification step_pairs verify_record "
+                        "verify_steps",
     })
