@@ -288,11 +288,11 @@ def _slopes(model: StepModel, theta: Reals, now: Reals) -> Reals:
 
 def _rows(model: StepModel, draws: Sequence[Reals], covariance: Reals, number: int) -> tuple[StepRow, ...]:
     """Return the compared quantities. ``draws``: parameters that the response permits, the fitted ones first."""
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     case, theta = model.case, draws[0]
     names = ("overshoot_share", "rise_s", "settling_s", "gain_nm_s_rad", "integral_nm_rad")
-    factor = float(t.ppf(0.5 + 0.5 * (1.0 - (1.0 - CONFIDENCE) / len(names)), number - 1))
+    factor = float(stdtrit(number - 1, 0.5 + 0.5 * (1.0 - (1.0 - CONFIDENCE) / len(names))))
     typed = (case.gains.gain_nm_s_rad, case.gains.integral_nm_rad)
     gains, fitted = [], model.loop(theta)[1]
     for k, (value, found) in enumerate(zip(typed, (fitted.gain_nm_s_rad, fitted.integral_nm_rad), strict=True)):
