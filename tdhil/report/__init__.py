@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     )
     from tdhil.report.card import (
         card_html as card_html, card_text as card_text, inertia_text as inertia_text, minutes as minutes,
-        print_card as print_card, rounded as rounded, with_interval as with_interval,
+        print_card as print_card,
     )
     from tdhil.report.console import (
         PlainConsole as PlainConsole, names_and_texts as names_and_texts, stderr_console as stderr_console,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_blocks as write_blocks, write_report as write_report,
     )
+    from tdhil.report.intervals import rounded as rounded, with_interval as with_interval
     from tdhil.report.letterhead import (
         LONGEST_LINE as LONGEST_LINE, MOST_LINES as MOST_LINES,
         NO_LETTERHEAD as NO_LETTERHEAD, Letterhead as Letterhead, clean_logo as clean_logo,
@@ -81,13 +82,14 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "acceptance": "AcceptanceVerdict acceptance_of",
         "blocks": "Column Picture Report ReportSection Table Text reference_of shown_date",
-        "card": "card_html card_text inertia_text minutes print_card rounded with_interval",
+        "card": "card_html card_text inertia_text minutes print_card",
         "console": "PlainConsole names_and_texts stderr_console",
         "document": "SIMULATED marks rehearsal_of rehearsed_faults result_document run_facts text_of",
         "verification": "print_verification verification_document verification_report write_verification_report",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "graphs": "GRAPHS",
+        "intervals": "rounded with_interval",
         "inertia_scope": "InertiaScope scope_text",
         "html": "ShownPicture check_report_path pictures_in write_blocks write_report",
         "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",

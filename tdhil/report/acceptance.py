@@ -13,9 +13,9 @@ from math import sqrt
 from typing import Any, Final
 
 from profiles import MessageCode, with_code
-from profiles.quantities import printed_interval
 from tdhil.config import ACCEPTED_QUANTITIES, Expectation
 from tdhil.report.inertia_scope import InertiaScope, scope_text
+from tdhil.report.intervals import with_interval
 
 Part = Mapping[str, Any]
 _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
@@ -121,8 +121,7 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
                 advice = "; expect motor-inertia instead" if scope == InertiaScope.MOTOR_SIDE else ""
                 other = f", which is {scope_text(scope)}, not {scope_text(own)}{advice}"
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
-        span = "" if low == high else f" ({printed_interval(low, high, 5)})"     # a setting of the run has none
-        seen = f"{how} {value:.5g}{span}{other}"
+        seen = f"{how} {with_interval(value, low, high, quantity.unit.symbol)}{other}"
     return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
                     value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
 

@@ -24,13 +24,11 @@ from tdhil.report.card import (
     in_milliradians,
     inertia_text,
     minutes,
-    plus_minus,
-    plus_minus_part,
-    rounded,
     sentence,
 )
 from tdhil.report.document import banner, coded_reason, coded_warnings, rehearsal_rows, text_of, uploaded_rows
 from tdhil.report.graphs import GRAPHS
+from tdhil.report.intervals import plus_minus, plus_minus_part, rounded
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
     BACKLASH,

@@ -14,9 +14,10 @@ from rich.text import Text as Words
 
 from tdhil.report.acceptance import SIGNATURE_LINE
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection, Table, shown_date
-from tdhil.report.card import interval_and_share, sentence
+from tdhil.report.card import sentence
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import NO_REAL_SHAFT, SIMULATED
+from tdhil.report.intervals import interval_and_share
 
 if TYPE_CHECKING:
     from tdhil.calibration import MeasuredValue

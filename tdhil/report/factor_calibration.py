@@ -25,8 +25,8 @@ from tdhil.report.calibration_page import (
     scale_error,
     shown_degrees,
 )
-from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole
+from tdhil.report.intervals import part_with_interval
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
 

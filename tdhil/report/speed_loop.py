@@ -16,10 +16,10 @@ from rich.text import Text as Words
 from profiles import CodedText, MessageCode, entry_of, with_code
 from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
-from tdhil.report.card import part_with_interval, table_cell
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import marks, only_finite
 from tdhil.report.graphs import GRAPHS
+from tdhil.report.intervals import part_with_interval, table_cell
 from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import plain_ticks
 from tdhil.report.schedule import gain_words, setting_words, settings_section

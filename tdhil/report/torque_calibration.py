@@ -25,8 +25,8 @@ from tdhil.report.calibration_page import (
     shown_degrees,
     with_share,
 )
-from tdhil.report.card import plus_minus
 from tdhil.report.console import PlainConsole
+from tdhil.report.intervals import plus_minus
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
 

@@ -12,10 +12,10 @@ from rich.text import Text as Words
 
 from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
-from tdhil.report.card import part_with_interval
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
 from tdhil.report.document import marks
 from tdhil.report.figure_words import meanings_section, print_meanings, words_of
+from tdhil.report.intervals import part_with_interval
 from tdhil.report.operator_map import map_figures, map_section, print_map
 from tdhil.report.schedule import (
     finite,

@@ -24,10 +24,10 @@ from tdhil.report.blocks import (
     report_of_run,
     shown_date,
 )
-from tdhil.report.card import table_cell
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import marks, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
+from tdhil.report.intervals import table_cell
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
 from tdhil.report.plots import DARK, OURS, QUIET
 

@@ -118,13 +118,19 @@ def test_the_gains_that_the_drive_reports_are_judged_if_none_was_measured():
     expected = {"gain": (250.0, 5.0), "integral-gain": (200.0, 10.0)}
     found = judged({**document(), "speed_loop_present": PRESENT}, expected)
     assert [one["verdict"] for one in found["quantities"]] == ["pass", "fail"]
-    assert found["quantities"][0]["text"].endswith("reported by the drive 250")
+    assert found["quantities"][0]["text"].endswith("reported by the drive 250 N·m·s/rad")
     (told,) = found["off"]
     assert "integral gain I" in told and "another integral time" in told
     measured = {"gain_nm_s_rad": part(300.0, 0.01), "integral_nm_rad": None}
     found = judged({**document(), "impedance": measured, "speed_loop_present": PRESENT}, expected)
     assert [one["verdict"] for one in found["quantities"]] == ["fail", "fail"]
     assert "identified 300" in found["quantities"][0]["text"]
+
+
+def test_an_identified_value_has_its_unit_and_the_digits_of_the_result():
+    """A signed report must not show one J as 108.1 in its head and as 108.01 in the acceptance."""
+    found = judged(document(inertia=103.8907, share=0.0395))
+    assert found["quantities"][0]["text"] == "pass: expected 104 ± 5 kg·m², identified 103.9 (99.7 to 108.0) kg·m²"
 
 
 def test_another_drive_is_named_by_its_identity():
@@ -152,7 +158,7 @@ def test_the_interval_decides_and_not_the_value():
     limit = {"torque-limit": (500.0, 10.0)}
     (told,) = judged(document(), limit)["off"]
     assert told.startswith("the torque limit of the run is 0.8 times the expected value")
-    assert judged(document(), limit)["quantities"][0]["text"].endswith("identified 400")      # a setting, not measured
+    assert judged(document(), limit)["quantities"][0]["text"].endswith("identified 400 N·m")      # a setting
     assert acceptance_of([], document()) is None
 
 

@@ -14,15 +14,10 @@ from tdhil.report.card import (
     card_text,
     estimate_text,
     inertia_text,
-    percent,
-    plus_minus,
-    plus_minus_part,
     print_card,
-    table_cell,
-    two_digits,
-    with_interval,
 )
 from tdhil.report.document import result_document
+from tdhil.report.intervals import percent, plus_minus, plus_minus_part, table_cell, two_digits, with_interval
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
 

@@ -1,0 +1,98 @@
+"""Numbers with the digits that their interval justifies. The ends of an interval are rounded outwards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from profiles.quantities import plain_number, printed_ends
+
+ASYMMETRIC = 1.2
+"""Ratio of the longer to the shorter side from which an interval is printed by its ends. Below it ± the longer side is
+less than a tenth wider than the interval."""
+
+
+def with_interval(value: float, low: float, high: float, unit: str) -> str:
+    """Return ``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width set the decimals."""
+    half = 0.5 * (high - low)
+    if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
+        return f"{plain_number(value, 5)} {unit}"
+    return "{} ({} to {}) ".format(*rounded(value, low, high)) + unit
+
+
+def part_with_interval(part: Mapping[str, Any], unit: str) -> str:
+    """Return a quantity of a document as `with_interval`."""
+    return with_interval(part["value"], part["low"], part["high"], unit)
+
+
+def table_cell(part: Mapping[str, Any], times: float = 1.0) -> str:
+    """Return ``2.31 (2.22 to 2.42)`` without a unit, the value alone where it is exact, a dash where it is None."""
+    value, low, high = (None if part[name] is None else times * part[name] for name in ("value", "low", "high"))
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if low == high else "{} ({} to {})".format(*rounded(value, low, high))
+
+
+def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
+    """Return the three values as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
+    ends = [number for number in (low, high) if number is not None]
+    half = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else 0.0
+
+    if half > 0.0 and math.isfinite(half) and low is not None and high is not None:
+        return "open" if value is None else _digits(value, half), *printed_ends(low, high, _decimals(half))
+    middle, below, above = ("open" if number is None else plain_number(number) for number in (value, low, high))
+    return middle, below, above
+
+
+def plus_minus(value: float, half_width: float) -> str:
+    """Return ``83.9 ± 3.0``, with decimals as in `with_interval`. The half-width covers the rounding of the value."""
+    if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
+        return plain_number(value)
+    middle = _digits(value, half_width)
+    apart = half_width + abs(float(middle) - value)
+    return f"{middle} ± {printed_ends(0.0, apart, _decimals(half_width))[1]}"
+
+
+def two_digits(half_width: float) -> str:
+    """Return a half-width with two significant digits and without an exponent: ``1200``, ``6.4``, ``0.000079``."""
+    return _digits(half_width, half_width) if 0.0 < half_width < math.inf else plain_number(half_width)
+
+
+def percent(half_width: float, value: float) -> str:
+    """Return ``±0.80 %`` of the value: two significant digits, rounded up."""
+    if not value or not math.isfinite(half_width):
+        return "±?"
+    share = 100.0 * half_width / abs(value)
+    return f"±{printed_ends(0.0, share, _decimals(share))[1] if share > 0.0 else '0'} %"
+
+
+def interval_and_share(value: float, low: float, high: float, unit: str) -> str:
+    """Return ``104.3 (100.1 to 108.4) kg·m²  ±4.0 %``. A clearly asymmetric interval has no ± behind it."""
+    ends = with_interval(value, low, high, unit).rstrip()
+    return ends if _asymmetric(value, low, high) else f"{ends}  {percent(max(value - low, high - value), value)}"
+
+
+def plus_minus_part(part: Mapping[str, Any]) -> str:
+    """Return ``83.9 ± 3.0``, or ``83.9 (81.0 to 88.2)`` if the interval is clearly asymmetric."""
+    value, low, high = part["value"], part["low"], part["high"]
+    if _asymmetric(value, low, high):
+        return "{} ({} to {})".format(*rounded(value, low, high))
+    return plus_minus(value, max(value - low, high - value))
+
+
+def _decimals(half_width: float) -> int:
+    """Return the decimals that end at the second significant digit of the half-width; negative for tens."""
+    return 1 - math.floor(math.log10(half_width))
+
+
+def _digits(number: float, half_width: float) -> str:
+    """Round to the second significant digit of the half-width, tens and hundreds included."""
+    decimals = _decimals(half_width)
+    return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # avoids −0
+
+
+def _asymmetric(value: float, low: float, high: float) -> bool:
+    """Return whether one side of the interval is clearly longer than the other."""
+    shorter, longer = sorted((value - low, high - value))
+    return math.isfinite(longer) and longer > ASYMMETRIC * shorter
