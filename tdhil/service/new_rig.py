@@ -113,18 +113,22 @@ def _given(typed: Mapping[str, str], known: tuple[str, ...] | None = None) -> di
 
 
 def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[DraftProblemView]:
-    """Return the entries that the rig needs and the draft does not have. A simulated rig needs no drive's entries."""
+    """Return the entries that the rig needs and the draft does not have. A simulated rig needs no drive's entries, and
+    all limits or none.
+    """
     found = [] if known.name else [DraftProblemView("name", "The rig needs its own name, such as bench 3.")]
     if body.load == "string":
         found += [DraftProblemView(name, "A drill string needs it.") for name in STRING_KEYS
                   if name not in known.string]
+    if known.limits or not body.simulated:
+        why = "A simulated rig has all limits or none." if body.simulated else "A real drive does not move without it."
+        found += [DraftProblemView(f"limits.{name}", f"Type this limit. {why}")
+                  for name in LIMIT_KEYS if name not in known.limits]
     if body.simulated:
         return found
     if not known.address:
         found.append(DraftProblemView("address", "Type the address of the drive. For a rig without a drive, select"
                                                  " Simulated."))
-    found += [DraftProblemView(f"limits.{name}", "Type this limit. A real drive does not move without it.")
-              for name in LIMIT_KEYS if name not in known.limits]
     if profile.rated_torque_by_hand and not known.drive_data:
         found.append(DraftProblemView("rated_torque_nm", "Type it from the name plate. The drive does not report it."))
     found += [DraftProblemView(f"parameters.{one.name}", "Read this value at the drive, and type it. The drive does not"
@@ -148,6 +152,8 @@ def _problem_of(message: str, profile: Profile) -> DraftProblemView:
         key = f"address.{inner}"
     elif key in _beside(profile.bus):
         key = f"address.{key}"
+    elif key == "gear.ratio":
+        key = "gear_ratio"
     return DraftProblemView(key.removeprefix("drive_data."), f"{text[:1].upper()}{text[1:]}.")
 
 

@@ -19,6 +19,7 @@ LIMIT_KEYS: Final = tuple(name for name, field in Limits.model_fields.items() if
 STRING_KEYS: Final = ("make_up_torque_nm", "torque_ramp_nm_s")
 """Keys that a drill string needs."""
 _NUMBER: Final = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?")
+_POWER_OF_TEN: Final = re.compile(_NUMBER.pattern + r"[eE][-+]?[0-9]+")
 _PLAIN: Final = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
 _WORDS: Final = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".inf", ".nan"}
 
@@ -106,7 +107,7 @@ def blank_rig(
               *(_entry(name, known.limits, Limits.model_fields[name].description) for name in LIMIT_KEYS)]
     parts += ["", *_load(load, known.string)]
     parts += ["", "#gear: {ratio: }    # motor turns per turn of the main shaft; default 1" if known.gear_ratio is None
-              else f"gear: {{ratio: {_typed(known.gear_ratio)}}}    # motor turns per turn of the main shaft",
+              else f"gear: {{ratio: {_quantity(known.gear_ratio)}}}    # motor turns per turn of the main shaft",
               "", "# Facts that the drive does not report. Omit unknown ones.",
               "drive_data:" if known.drive_data or known.parameters else "#drive_data:"]
     if profile.rated_torque_by_hand or "rated_torque_nm" in known.drive_data:
@@ -155,14 +156,14 @@ def _load(load: str, known: Mapping[str, Any]) -> list[str]:
     if load == "none":
         return ["load: none    # as requested: no load that stores torque. With a drill string: string"]
     return ["load: string    # as requested; this file is refused until these two are filled in",
-            *(f"{name}: {_typed(known[name])}    # {Rig.model_fields[name].description}" if name in known
+            *(f"{name}: {_quantity(known[name])}    # {Rig.model_fields[name].description}" if name in known
               else f"#{name}:    # {Rig.model_fields[name].description}" for name in STRING_KEYS)]
 
 
 def _entry(name: str, known: Mapping[str, Any], description: str | None) -> str:
     """Return the line of a key in a section: its known value, or a blank."""
     if name in known:
-        return f"  {name + ':':<24} {_typed(known[name]):<10} # {description}"
+        return f"  {name + ':':<24} {_quantity(known[name]):<10} # {description}"
     return f"#  {name + ':':<24} # {description}"
 
 
@@ -193,6 +194,12 @@ def _typed(value: Any) -> str:
     return text if _NUMBER.fullmatch(text) else scalar(value)
 
 
+def _quantity(value: Any) -> str:
+    """Return a quantity as typed: a power of ten, which in an address is a text, is a number, too."""
+    text = str(value).strip()
+    return text if _POWER_OF_TEN.fullmatch(text) else _typed(value)
+
+
 def _doubts(profile: Profile | None, accepted: Sequence[str] = ()) -> list[str]:
     names = [] if profile is None else [name for name, _ in doubtful(profile)]
     if profile is None or not names:
@@ -210,7 +217,7 @@ def _doubts(profile: Profile | None, accepted: Sequence[str] = ()) -> list[str]:
 def _untold(profile: Profile | None, known: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
     """Return lines for the parameters that cannot be read over the bus."""
     lines = [] if profile is None else [
-        f"    {one.name}: {_typed(known[one.name])}    # {_comment(one.title)}" if one.name in known
+        f"    {one.name}: {_quantity(known[one.name])}    # {_comment(one.title)}" if one.name in known
         else f"#    {one.name}:    # {_comment(one.title)}" for one in profile.untold]
     return ["  parameters:" if known else "#  parameters:", *lines] if lines else []
 

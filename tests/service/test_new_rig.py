@@ -67,6 +67,11 @@ def test_a_simulated_rig_may_have_the_limits_of_the_real_one():
         "name", *STRING}
 
 
+def test_a_limit_may_be_typed_as_a_power_of_ten():
+    found = draft_of(complete("maxon/epos4", limits=LIMITS | {"torque_nm": "4e2"}))
+    assert found.problems == [] and parse_rig(found.text, "rig.yaml").limits.torque_nm == 400.0
+
+
 def test_a_simulated_drive_is_asked_for_no_parameter():
     found = draft_of(complete("siemens/g120", simulated=True))
     assert found.problems == [] and not parse_rig(found.text, "rig.yaml").drive_data.parameters
@@ -91,6 +96,8 @@ def fields_of(**changed):
     ({"limits": LIMITS | {"speed_max_rad_s": "95 rpmm"}}, "limits.speed_max_rad_s", "'rpmm' is not a unit"),
     ({"limits": LIMITS | {"probe_torque_nm": "900"}}, "limits.probe_torque_nm", "Must not be above torque_nm"),
     ({"string": {}}, "make_up_torque_nm", "A drill string needs it"),
+    ({"gear_ratio": "0"}, "gear_ratio", "Must be at least"),
+    ({"simulated": True, "limits": {"torque_nm": "400"}}, "limits.time_s", "all limits or none"),
     ({"accept_unverified": []}, "accept_unverified", "accept them: modes, quick_stop"),
 ])
 def test_a_mistake_is_marked_at_its_field(changed, field, said):
@@ -134,7 +141,7 @@ def stays(text):
 def test_a_line_break_adds_no_key():
     found = draft_of(complete("maxon/epos4", name="a\nservice: {motion: watched}",
                               gear_ratio="1}\nallow_reverse: true"))
-    assert "gear.ratio" in {one.field for one in found.problems} and "\nallow_reverse" not in found.text
+    assert "gear_ratio" in {one.field for one in found.problems} and "\nallow_reverse" not in found.text
     assert "\nservice: {motion: watched}" not in found.text
 
 

@@ -39,7 +39,7 @@
     if (!form) return;
     const said = byId("new-rig-said"), field = (name) => form.elements[name];
     field("name").addEventListener("input", () => {
-      if (!field("id").dataset.typed) field("id").value = field("name").value.trim().toLowerCase().replace(/[^a-z0-9_.]+/g, "-").replace(/^[^a-z0-9]+|-+$/g, "").slice(0, 64);
+      if (!field("id").dataset.typed) field("id").value = field("name").value.trim().toLowerCase().normalize("NFKD").replace(/\p{M}/gu, "").replaceAll("ß", "ss").replace(/[^a-z0-9_.]+/g, "-").replace(/^[^a-z0-9]+|-+$/g, "").slice(0, 64);
     });
     field("id").addEventListener("input", () => { field("id").dataset.typed = "by hand"; });
     const opens = closes(form.querySelectorAll("button"));      // the Enter key would send the form before its script is ready

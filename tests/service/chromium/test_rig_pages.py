@@ -191,11 +191,23 @@ def test_a_simulated_rig_is_added_without_a_drive(page, rigs):
     page.get_by_label("Name in reports").fill("Bench 4")
     page.get_by_label("Profile:").select_option("maxon/epos4")
     page.get_by_label("Simulated: there is no drive").check()
-    for hidden in ("3. Settings at the drive", "Scan for the drive", "5. Motion from the browser"):
+    for hidden in ("Settings at the drive", "Scan for the drive", "Motion from the browser"):
+        assert page.get_by_text(hidden, exact=True).count() == 1
         assert not page.get_by_text(hidden, exact=True).is_visible()
     page.reload()                                                   # what was typed is there again
     page.get_by_label("Simulated: there is no drive").wait_for()
-    page.get_by_text("These may stay empty").wait_for()
+    page.get_by_text("Type all of them or none").wait_for()
+    page.get_by_label("Name in reports").fill("Prüfstand Größe 1")          # an id that a German recognizes
+    assert page.get_by_label("Id:").input_value() == "prufstand-grosse-1"
+    page.get_by_label("Name in reports").fill("Bench 4")
+    gear = page.get_by_role("textbox", name="Gear:")
+    gear.fill("0")
+    page.get_by_role("textbox", name="Longest run").fill("15 min")
+    page.get_by_role("button", name="Check").click()
+    page.get_by_text("7 entries need a correction. Each is marked at its field.").wait_for()
+    assert page.locator("label .wrong").count() == 7 and page.locator("#new-rig-said").is_hidden()
+    gear.fill("")
+    page.get_by_role("textbox", name="Longest run").fill("")
     page.get_by_role("button", name="Save the rig").click()
     page.wait_for_url("**/start/bench-4")
     page.get_by_text("SIMULATED").first.wait_for()
