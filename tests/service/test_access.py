@@ -194,6 +194,15 @@ def test_a_page_leads_to_the_login_and_back(guarded, path):
     assert guarded.client.get("/static/app.js").status_code == 200
 
 
+@pytest.mark.parametrize(("path", "form"), [
+    ("/rehearse/a", 'id="rehearse"'), ("/fleets", 'id="ask"'), ("/runs/{run}", 'id="replay"'),
+    ("/upload", 'id="file"')])
+def test_a_page_has_no_form_that_its_reader_may_not_send(guarded, path, form):
+    page = path.format(run=guarded.run())
+    for role in ROLES:
+        assert (form in guarded.client.get(page, headers=guarded.sessions[role]).text) == (role != "viewer"), role
+
+
 @pytest.mark.parametrize("there", [
     "//evil.example/", "https://evil.example", "/\\evil.example", "javascript:alert(1)", "", "/%0d%0aSet-Cookie",
     "/a b"])

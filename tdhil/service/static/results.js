@@ -193,7 +193,7 @@
       });
     }
     const replay = byId("replay");
-    replay.addEventListener("submit", (event) => {
+    if (replay) replay.addEventListener("submit", (event) => {
       event.preventDefault();
       const said = byId("replay-said");
       said.className = "alarm";
@@ -724,8 +724,8 @@
   function fleetsPage() {
     const form = byId("ask");
     let shown = "";
-    call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || tr("the runs of this service")))), () => {});
-    form.addEventListener("submit", (event) => {
+    if (form) call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || tr("the runs of this service")))), () => {});
+    if (form) form.addEventListener("submit", (event) => {
       event.preventDefault();
       submits(form, byId("said"), async () => {
         const found = await call("POST", "/fleets", asked(form));
@@ -783,8 +783,8 @@
       byId("state").textContent = stateOf(view) + (going && view.left_s !== null ? `, ${tr("about {time} left", { time: span(view.left_s) })}` : "");
       byId("progress").max = view.total || 1;
       byId("progress").value = view.done;
-      byId("end").hidden = !going;
-      byId("again").hidden = going;
+      byId("end").hidden = !going || !may("operator");
+      byId("again").hidden = going || !may("operator");
       byId("table").hidden = going || !view.summary;
       said.hidden = !view.error;
       said.textContent = view.error ? errorText(view.error) : "";
