@@ -170,8 +170,19 @@ class Option:
         """Text of an empty field: the value that applies."""
         if self.form is None or self.form.hint or self.default is None or self.joined:
             return self.unset if self.form is None else self.form.hint or self.unset
-        default = self.default if self.form.unit is None else f"{self.form.unit.of_si(self.default):g}"
-        return f"as rig.yaml, else {default}"
+        return f"as rig.yaml, else {self._form_default}"
+
+    @property
+    def form_help(self) -> str:
+        """Sentence below the field of a form: a default has the unit of the field."""
+        if self.form is None or self.form.unit is None or self.default is None:
+            return self.help_text
+        return self.help.replace("{default}", f"{self._form_default} {self.form.unit.symbol}")
+
+    @property
+    def _form_default(self) -> str:
+        unit = None if self.form is None else self.form.unit
+        return str(self.default) if unit is None else f"{unit.of_si(self.default):g}"
 
 
 def option(
@@ -510,13 +521,13 @@ class RunDetails(_Said):
     )
     faults: tuple[str, ...] = option(
         "--fault", group=Topic.SIMULATED, default=(), metavar="FAULT", api=True,
-        form=Form("Rehearse a fault", ("simulated",), hint="sto@hold+2s"),
+        form=Form("Rehearse a fault", ("simulated",), hint="none, or such as sto@hold+2s"),
         help="rehearse a fault of the embedded rig, such as sto@hold+2s; 'list' prints all of them",
     )
     expect: tuple[str, ...] = option(
         "--expect", group=Topic.RESULT, default=(), metavar="NAME=VALUE±TOL", api=True,
         form=Form("Expected values of an acceptance", ("run",), wide=True,
-                  hint="inertia=104 kg·m² ± 5 %, speed-lag=400 ms ± 50 ms"),
+                  hint="such as inertia=104 kg·m² ± 5 %, speed-lag=400 ms ± 50 ms"),
         help="accept the result only if it agrees with this value, such as 'inertia=104±5%'; names as in `acceptance:` "
              "of rig.yaml",
     )

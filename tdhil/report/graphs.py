@@ -27,7 +27,7 @@ GRAPHS = {
     "run": Graph(
         "Speed and torque",
         "all periods look alike, and the torque stays below its limit",
-        "the torque is cut off (lower the amplitude), the speed comes near zero (raise the offset), or the periods "
+        "the torque is cut off (lower the amplitude), the speed comes near zero (raise the mean speed), or the periods "
         "drift (warm up)"),
     "live": Graph(
         "J during the run",
@@ -54,7 +54,7 @@ GRAPHS = {
     "friction": Graph(
         "Friction over speed",
         "the points lie on a straight line",
-        "the points bend (stay above the bend, with a larger offset), or two points at one speed differ (warm up)"),
+        "the points bend (stay above the bend, with a higher mean speed), or two points at one speed differ (warm up)"),
     "impedance": Graph(
         "The drive's own impedance",
         "the points lie on the curve, and the band of |r| is narrow",

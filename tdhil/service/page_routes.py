@@ -42,23 +42,15 @@ AS_RIG: Final = "as rig.yaml, else "
 """First part of the text of an empty field whose value the rig's file may state (`Option.form_hint`)."""
 
 
-def _hint(language: Language, option: Option) -> str:
-    """Return the text of an empty field in a language."""
-    hint = option.form_hint
-    if hint.startswith(AS_RIG):
-        return str(language.text("as rig.yaml, else {value}", value=language.word(hint.removeprefix(AS_RIG))))
-    return language.word(hint)
-
-
-def _settings(rig: RigFile) -> Mapping[str, Setting]:
-    """Return the settings of a run of this rig without any request; none for an unusable rig."""
+def _stated(rig: RigFile) -> dict[str, Mapping[str, Any]]:
+    """Return the settings and the expected values that a run has without any request; none for an unusable rig."""
     with suppress(TdhilError):
-        return rig.way()[0].settings
-    return {}
+        return {"settings": rig.way()[0].settings, "expected": {} if rig.rig is None else rig.rig.acceptance}
+    return {"settings": {}, "expected": {}}
 
 
 def _applies(language: Language, option: Option, settings: Mapping[str, Setting]) -> str | Markup:
-    """Return the text of an empty field of the start form: the value that applies, from the rig's file or built in."""
+    """Return the text of an empty field of a form: the value that applies, from the rig's file or built in."""
     setting = settings.get(option.name)
     if setting is not None and setting.origin is Origin.RIG_FILE and setting.value is not None and not option.joined:
         number = isinstance(setting.value, int | float)
@@ -73,7 +65,7 @@ def _applies(language: Language, option: Option, settings: Mapping[str, Setting]
 
 def _about(language: Language, option: Option) -> str:
     """Return the help of an option with its limits, in a language."""
-    said = language.word(option.help_text)
+    said = language.word(option.form_help)
     text, values = limits_text(option)
     if not text:
         return f"{said[0].upper()}{said[1:]}."
@@ -102,7 +94,8 @@ class Pages:
                 stated_options=[OPTION[name] for name in STATED],
                 language=language, languages=self._languages.values(),
                 graphs=GRAPHS, kept=self._kept.__getitem__, _=language.text, word=language.word,
-                hint=partial(_hint, language), applies=partial(_applies, language), about=partial(_about, language),
+                hint=partial(_applies, language, settings={}), applies=partial(_applies, language),
+                about=partial(_about, language),
                 code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
                 speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
             found.filters["number"] = language.number
@@ -152,7 +145,7 @@ class Pages:
             for name, one in request.path_params.items():
                 known[name] = await off(partial(view_of[name], one))
             if template == "start.html":
-                known["settings"] = await off(lambda: _settings(site.supervisor.rigs.get(request.path_params["rig"])))
+                known |= await off(lambda: _stated(site.supervisor.rigs.get(request.path_params["rig"])))
             if template in ("rigs.html", "new_rig.html"):
                 known["folder"] = site.supervisor.rigs.folder is not None
                 known["built_in"] = await off(lambda: site.supervisor.rigs.built_in)

@@ -123,10 +123,10 @@ def vocabulary() -> Iterator[Text]:
             assert one.form is not None
             yield from (Text(options, "", label) for label in (one.form.label, *(label for _, label in one.form.ticks)))
             hint = one.form_hint.removeprefix(AS_RIG)
-            if re.search(r"[A-Za-z]{2,}", hint) and hint not in (one.allowed or ()) and "@" not in hint:
+            if re.search(r"[A-Za-z]{2,}", hint) and hint not in (one.allowed or ()):
                 yield Text(options, "", hint)
     for one in form_options("acquire"):
-        yield Text(options, "", one.help_text)
+        yield Text(options, "", one.form_help)
     for text in LIMIT_TEXTS:
         yield Text("tdhil/service/start_request.py", "", text)
         holes = [one for one in ("low", "high") if f"{{{one}}}" in text]

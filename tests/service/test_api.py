@@ -802,6 +802,24 @@ def test_an_empty_field_of_the_start_form_shows_the_value_of_the_rig_s_file(clie
     assert 'name="max_time_s" placeholder="1,5 min (Datei der Anlage)"' in german
 
 
+def test_a_default_in_a_help_has_the_unit_of_its_field(client):
+    assert "Coverage of the interval (default 95 %); at least 50 % and below 100 %." in client.get("/start/a").text
+
+
+def test_the_start_form_shows_the_expected_values_of_the_rig_s_file(client, rigs):
+    assert "The rig&#39;s file expects" not in client.get("/start/a").text
+    (rigs / "a.yaml").write_text("run: {simulate: true}\n"
+                                 "acceptance: {inertia: 104 kg·m² ± 5 %, coulomb: 60 N·m ± 9 N·m}\n")
+    page = client.get("/start/a").text
+    assert "The rig&#39;s file expects inertia=104 kg·m² ± 5 %, coulomb=60 N·m ± 9 N·m." in page
+
+
+def test_an_empty_field_shows_an_example_as_an_example(client):
+    page = client.get("/start/a").text
+    assert 'name="fault" placeholder="none, or such as sto@hold+2s"' in page
+    assert 'name="expect" placeholder="such as inertia=104 kg·m² ± 5 %' in page
+
+
 def test_every_option_that_http_accepts_has_a_field_of_the_start_form():
     without = {"accept_wider_limit": "of one drive, by name", "real_time_priority": "the service decides"}
     shown = {one.name for part in ("run", "acquire", "simulated", "real") for one in form_options(part)}

@@ -160,7 +160,18 @@
       redo.forEach((draw) => draw());
     });
   }
-  const percent = (share) => (share === null || share === undefined ? "" : `±${precise(100 * share, 2)} %`);
+  /** Format half of an interval as a share: two digits, rounded up, as on the terminal's card and in the report. */
+  function percent(share) {
+    if (share === null || share === undefined) return "";
+    const found = 100 * share, step = found > 0 ? 10 ** (Math.floor(Math.log10(found)) - 1) : 1;
+    return `±${precise(Math.ceil(found / step - 1e-6) * step, 2)} %`;
+  }
+  const ASYMMETRIC = 1.2;            // as in report/intervals.py
+  /** Half of an interval as a share of its value; '' if one side is clearly longer than the other. */
+  function shareOf(value, low, high) {
+    const sides = [value - low, high - value];
+    return Math.max(...sides) > ASYMMETRIC * Math.min(...sides) ? "" : percent(Math.max(...sides) / Math.abs(value));
+  }
   /** Format local time with an unambiguous month. */
   const two = (one, digits = 2) => String(one).padStart(digits, "0");
   const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
@@ -516,7 +527,7 @@
   function stopSteps(stop, asking = false) {
     const steps = [];
     if (asking && !stop.asked) steps.push(el("li", {}, tr("requesting …")));
-    if (stop.asked) steps.push(el("li", {}, tr("requested {time}", { time: clock(stop.asked) })));
+    if (stop.asked) steps.push(el("li", {}, tr("stop requested {time}", { time: clock(stop.asked) })));
     if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive responded {time}", { time: clock(stop.seen) })));
     if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}${tr("standstill {time}", { time: clock(stop.at_rest) })}`));
     if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired stop")));
@@ -930,7 +941,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, shareOf, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

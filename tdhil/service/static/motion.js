@@ -6,6 +6,7 @@
   const HEIGHT = 190;
   const LEAST_S = 0.2;           // shortest view: five displayed samples
   const DRAG_PX = 6;             // a shorter drag is a click
+  const NAMES_PX = 18;           // room for the names of the stages above a chart
   const STEP = 0.25, ZOOM = 2;   // a press of a button moves by a quarter of the view, or halves it
   const HINT = tr("Drag across a chart to zoom. Double-click shows the whole run.");
 
@@ -147,19 +148,22 @@
     function marks(chart, self) {
       const c = self.ctx, px = devicePixelRatio, { left, top, width, height } = self.bbox;
       c.save();
-      c.beginPath(); c.rect(left, top, width, height); c.clip();
-      c.lineWidth = px;
       c.font = `${11 * px}px system-ui, sans-serif`;
       c.textAlign = "left";
       c.textBaseline = "bottom";
-      c.strokeStyle = colour("--line");
       c.fillStyle = colour("--dim");
       let from = samples[0][0] ?? 0;
-      for (const stage of stages) {
-        const x = self.valToPos(stage.end_s, "x", true), before = Math.max(self.valToPos(from, "x", true), left);
-        c.beginPath(); c.moveTo(x, top); c.lineTo(x, top + height); c.stroke();
-        if (chart.column === 1 && x - before > c.measureText(word(stage.name, "stage")).width + 8 * px) c.fillText(word(stage.name, "stage"), before + 4 * px, top + height - 3 * px);
+      if (chart.column === 1) for (const stage of stages) {          // above the chart, where no curve crosses the names
+        const name = word(stage.name, "stage"), after = Math.min(self.valToPos(stage.end_s, "x", true), left + width), before = Math.max(self.valToPos(from, "x", true), left);
+        if (after - before > c.measureText(name).width + 4 * px) c.fillText(name, before + 4 * px, top - 3 * px);
         from = stage.end_s;
+      }
+      c.beginPath(); c.rect(left, top, width, height); c.clip();
+      c.lineWidth = px;
+      c.strokeStyle = colour("--line");
+      for (const stage of stages) {
+        const x = self.valToPos(stage.end_s, "x", true);
+        c.beginPath(); c.moveTo(x, top); c.lineTo(x, top + height); c.stroke();
       }
       c.strokeStyle = colour("--limit");
       c.lineWidth = 1.5 * px;
@@ -177,7 +181,7 @@
       for (const chart of charts) {
         if (chart.plot) chart.plot.destroy();
         chart.plot = new uPlot({
-          width: chart.where.clientWidth || 320, height: HEIGHT, legend: { show: false },
+          width: chart.where.clientWidth || 320, height: HEIGHT, legend: { show: false }, padding: [chart.column === 1 ? NAMES_PX : null, null, null, null],
           cursor: { ...view.cursor, sync: { key: "motion" } },
           scales: {
             x: { time: false, range: () => view.range() },

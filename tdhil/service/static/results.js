@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { byLabels, coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, show, span, speedUnit, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, shareOf, show, span, speedUnit, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
@@ -25,7 +25,7 @@
     const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
     // an estimate that is proportional to the torque is quoted with the torque scale, like J
     const quoted = (one) => (one && one.low_total !== undefined ? { ...one, low: one.low_total, high: one.high_total } : one);
-    if (J) rows.push([tr("J, {share} % interval to quote", { share: number(100 * (J.confidence ?? 0.95)) }), `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], [tr("repeatability, this drive"), `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
+    if (J) rows.push([tr("J, {share} % interval to quote", { share: number(100 * (J.confidence ?? 0.95)) }), `${ofResult(result)}  ${shareOf(J.value, J.low_total, J.high_total)}`], [tr("repeatability, this drive"), `${of(J)} kg·m²  ${shareOf(J.value, J.low, J.high)}`]);
     for (const [name, key, unit] of [[tr("viscous friction B"), "viscous_nm_s_rad", "N·m·s/rad"], [tr("Coulomb friction T_c, constant load included"), "coulomb_nm", "N·m"], [tr("lag of the reported speed"), "speed_lag_s", "s"], [tr("lag of the reported torque"), "torque_lag_s", "s"], [tr("time offset between speed and torque"), "skew_s", "s"]]) {
       const text = estimate(quoted(result[key]), unit);
       if (text) rows.push([name, text]);
@@ -140,7 +140,7 @@
         el("th", { scope: "row" }, one.first ? tr("the run itself") : english(Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ")) || tr("as the run")),
         el("td", {}, one.state === "waiting" ? waits(one) : one.error ? errorText(one.error) : word(one.result.verdict, "verdict")),
         el("td", {}, ofResult(one.result) || "–"),
-        el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
+        el("td", {}, one.result && one.result.inertia_kg_m2 ? shareOf(one.result.inertia_kg_m2.value, one.result.inertia_kg_m2.low_total, one.result.inertia_kg_m2.high_total) : ""))));
     });
     let typed = false;
     byId("main").addEventListener("input", () => { typed = true; });

@@ -453,6 +453,22 @@ def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
         assert download.value.suggested_filename.startswith(run)
         return Path(download.value.path()).read_bytes()
 
+    above = page.evaluate("""async () => {
+        let named = null;
+        const write = CanvasRenderingContext2D.prototype.fillText;
+        CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+            if (text === "setup") named = { y, over: this.canvas.parentElement.querySelector(".u-over") };
+            write.call(this, text, x, y);
+        };
+        const second = window.tdhil.motion("second");
+        second.set([[0, 1, 2], [0, 1, 2], [0, 1, 2]]);
+        second.stages([{ name: "setup", end_s: 1.5 }]);
+        await new Promise(requestAnimationFrame);
+        const above = devicePixelRatio * named.over.offsetTop - named.y;
+        for (const id of ["plot-speed", "plot-torque"]) document.querySelector(`#${id} .uplot:last-child`).remove();
+        return above;
+    }""")
+    assert 0 < above < 18            # px: the name of a stage stands above the area of the curve
     time_s, speed_rad_s, torque_nm = move(0.5)
     assert (time_s, speed_rad_s, torque_nm) == pytest.approx((1.0, 10.0 * time_s, -20.0 * time_s), abs=0.06)
     move(0.25)
@@ -502,7 +518,8 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.get_by_text("speed was quantised").wait_for()
     shown = page.locator("time").first.inner_text()
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC([+-]\d\d:\d\d)?", shown)      # local, with its zone
-    page.get_by_role("row", name="J, 90 % interval to quote").wait_for()
+    quoted = page.get_by_role("row", name="J, 90 % interval to quote")
+    quoted.get_by_text("104.0 (100.0 to 108.0) kg·m² ±3.9 %").wait_for()           # 3.85 %, rounded up as in the report
     page.locator(".pictures img").evaluate("one => one.decode()")
     page.get_by_text("Friction over speed, in numbers").click()
     page.get_by_role("row", name="2 rad/s 76").wait_for()

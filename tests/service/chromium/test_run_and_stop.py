@@ -98,6 +98,7 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     page.get_by_text("drive responded").wait_for()
     served.service.wait(run, "stopped")
     page.get_by_text("stopped, at standstill").wait_for()
+    page.locator("li", has_text="stop requested ").wait_for()          # the page of the result names what was requested
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
