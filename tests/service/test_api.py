@@ -18,13 +18,15 @@ import jsonschema
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
-from tdhil.config import STATED, form_options
+from tdhil.config import STATED, form_options, load_rig
 from tdhil.config.options import OPTION, OPTIONS, Form
 from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
+from tdhil.runner.stages.speed import mean_speeds
 from tdhil.service.run_filter import RunFilter
 from tdhil.service.run_state import State
 from tdhil.service.schemas import API, ROUTES, SOCKETS, document
+from tdhil.session.task import machine_limits
 from tests.service.conftest import HANGS_S, URL, Service, wait_for
 
 # -- what there is
@@ -812,6 +814,15 @@ def test_the_start_form_shows_the_expected_values_of_the_rig_s_file(client, rigs
                                  "acceptance: {inertia: 104 kg·m² ± 5 %, coulomb: 60 N·m ± 9 N·m}\n")
     page = client.get("/start/a").text
     assert "The rig&#39;s file expects inertia=104 kg·m² ± 5 %, coulomb=60 N·m ± 9 N·m." in page
+
+
+def test_the_start_page_names_the_speeds_of_stage_2_which_no_field_of_the_form_changes(client, rigs):
+    limits = machine_limits(load_rig(rigs / "real.yaml"))
+    page = client.get("/start/real").text
+    first, table = page.index('id="first"'), page.index("speeds of stage 2")
+    for part in (page[first:], page[table:]):
+        shown = re.findall(r'data-speed="([^"]+)"', part)[:2]
+        assert [float(one) for one in shown] == pytest.approx(mean_speeds(limits))
 
 
 def test_an_empty_field_shows_an_example_as_an_example(client):

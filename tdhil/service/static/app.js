@@ -373,8 +373,8 @@
       [tr("expected interval of J (repeatability)"), half === null ? tr("not predicted") : percent(half)],
       [tr("time"), tr("{time}, of which {part} are stage 5", { time: span(plan.duration_s + 90), part: span(plan.duration_s) })],
       [tr("motion"), tr("{excitation} in {mode} mode", { excitation: plan.excitation, mode: word(plan.mode, "mode") })],
-      [tr("speed"), ofSpeed(() => tr("{low} to {high} {unit} (limits {least} to {most})", { low: speed(plan.speed_rad_s.min), high: speed(plan.speed_rad_s.max), unit: speedUnit(), least: speed(plan.limits.speed_min_rad_s), most: speed(plan.limits.speed_max_rad_s) }))],
-      [tr("torque, N·m"), tr("{low} to {high} (limit ±{most})", { low: number(plan.torque_nm.min, 3), high: number(plan.torque_nm.max, 3), most: number(plan.limits.torque_nm, 3) })],
+      [tr("speed in stage 5"), ofSpeed(() => tr("{low} to {high} {unit} (limits {least} to {most})", { low: speed(plan.speed_rad_s.min), high: speed(plan.speed_rad_s.max), unit: speedUnit(), least: speed(plan.limits.speed_min_rad_s), most: speed(plan.limits.speed_max_rad_s) }))],
+      [tr("torque in stage 5, N·m"), tr("{low} to {high} (limit ±{most})", { low: number(plan.torque_nm.min, 3), high: number(plan.torque_nm.max, 3), most: number(plan.limits.torque_nm, 3) })],
     ];
     const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `${tr("±{share} % can't be reached:", { share: number(100 * plan.stopping.tolerance, 3) })} `, english(plan.stopping.advice)) : null;
     return [
