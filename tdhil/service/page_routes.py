@@ -149,6 +149,8 @@ class Pages:
             if template in ("rigs.html", "new_rig.html"):
                 known["folder"] = site.supervisor.rigs.folder is not None
                 known["built_in"] = await off(lambda: site.supervisor.rigs.built_in)
+            if template == "runs.html":
+                known["rig_names"] = await off(lambda: {one.id: one.name for one in site.supervisor.rigs.all()})
             if here == "docs":
                 known["api"] = await off(api_page)
             return self.render(request, template, here, **known)

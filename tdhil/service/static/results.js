@@ -333,6 +333,7 @@
     none.addEventListener("click", () => { chosen.clear(); said(); draw(); });
     form.elements.state.append(...Object.entries(STATES).map(([state, text]) => el("option", { value: state }, text)));
 
+    const names = JSON.parse(document.body.dataset.rigs), nameOf = (rig) => names[rig] || rig;      // a removed rig has its id only
     /** Fill a choice with the values that occur. The chosen one stays, also if it occurs no more. */
     function offer(select, values, text = (one) => one) {
       const now = query.get(select.name) || "", all = [...new Set([...values, ...(now ? [now] : [])])];
@@ -341,7 +342,7 @@
       select.value = now;
     }
     const choices = (rigs, verdicts, found) => {
-      offer(form.elements.rig, rigs);
+      offer(form.elements.rig, rigs, nameOf);
       offer(form.elements.verdict, verdicts, (one) => word(one, "verdict"));
       offer(form.elements.tag, found);
     };
@@ -366,7 +367,7 @@
       const people = (one) => [one.operator, one.note].filter(Boolean).join(": ");
       const filtered = [...query.keys()].some((one) => !TURNED.includes(one) && one !== "archived");
       show(byId("runs"), ...(found.runs.length ? found.runs.map((one) => {
-        const at = when(one.asked), rig = one.rig || NO_RIG, name = `${rig}, ${at}`;
+        const at = when(one.asked), rig = one.rig ? nameOf(one.rig) : NO_RIG, name = `${rig}, ${at}`;
         const box = el("input", { type: "checkbox", "aria-label": tr("compare {run}", { run: name }), disabled: one.verdict === null });
         box.checked = chosen.has(one.id);
         box.addEventListener("change", () => { if (box.checked) chosen.set(one.id, one.rehearsal); else chosen.delete(one.id); said(); });

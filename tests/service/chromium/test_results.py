@@ -181,6 +181,18 @@ def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390, text
 
 
+def test_the_list_of_runs_names_a_rig_as_its_other_pages_do(page, served):
+    run = served.service.supervisor.start_run("hostile", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    page.goto("/runs")
+    link = page.locator("#runs a")
+    link.wait_for()
+    assert (link.inner_text(), link.get_attribute("href")) == (HOSTILE, f"/runs/{run}")
+    page.locator("select[name=rig]").select_option(label=HOSTILE)
+    page.wait_for_url("**/runs?rig=hostile")
+    assert page.evaluate("window.pwned") is None
+
+
 def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
     for rig, operator in (("a", "Anna"), ("b", "Berta"), ("a", "Carla")):
         run = served.service.supervisor.start_run(rig, {"note": "done", "operator": operator}, "local").request.id
@@ -418,7 +430,7 @@ def test_a_stopped_run_is_compared_and_each_verdict_has_its_colour(page, served,
     rows[runs[0]].get_by_text("stopped, at standstill").wait_for()
     colours = [rows[run].locator(".verdict").evaluate("one => getComputedStyle(one).color") for run in runs]
     assert len({*colours, page.evaluate("getComputedStyle(document.body).color")}) == 4
-    assert rows[runs[0]].locator("th, td:not(.pick)").first.inner_text().startswith("a")         # the rig comes first
+    assert rows[runs[0]].locator("th, td:not(.pick)").first.inner_text().startswith("Rig a")     # the rig comes first
     assert page.locator("thead th").nth(1).inner_text().strip().lower().startswith("rig")
     rows_of = [asdict(FleetRow(run, "valid", rig="a", inertia_kg_m2=104.0, aborted_by="operator")) for run in runs[:2]]
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": {
