@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from drivers import CommunicationLost
 from profiles import DataFileError, Profile, load_profile, profile_names
-from tdhil.buses import FoundDrive, bus_named, required_text
+from tdhil.buses import FoundDrive, bus_named, required_text, unit_text
 from tdhil.config import Limits, Rig, parse_rig
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.service.schemas import (
@@ -48,20 +48,19 @@ def _view(profile: Profile) -> ProfileView:
     return ProfileView(
         profile.name, profile.title, profile.bus, bus_named(profile.bus).title, profile.experimental,
         by_hand(profile), {name: entry.source for name, entry in doubtful(profile)}, profile.rated_torque_by_hand,
-        [FieldView(f"parameters.{one.name}", one.title, required_text(one.require, "") if one.require else "")
+        [FieldView(f"parameters.{one.name}", one.title,
+                   required_text(one.require, unit_text(one.unit)) if one.require else "", unit_text(one.unit))
          for one in profile.untold], _address_fields(profile.bus),
     )
 
 
 def _address_fields(bus: str) -> list[FieldView]:
     """Return the fields of the drive's address: keys of the bus's section with one value, and its keys beside it."""
-    known = bus_named(bus)
-    model = known.section_model
+    model = bus_named(bus).section_model
     fields = [] if model is None else [
         FieldView(name, field.description or "") for name, field in model.model_fields.items()
         if field.default is None]
-    beside = _beside(bus)
-    return fields + [FieldView(name, "number of the drive on the bus") for name in beside]
+    return fields + [FieldView(name, "number of the drive on the bus") for name in _beside(bus)]
 
 
 def draft_of(body: DraftBody) -> DraftView:

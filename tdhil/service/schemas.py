@@ -55,11 +55,12 @@ class RigView:
 
 @dataclass(frozen=True)
 class FieldView:
-    """A key of a rig's file, with its unit and meaning, and what the drive has to have there: empty for any value."""
+    """A key of a rig's file: its meaning, what the drive has to have there (empty for any value), and its unit."""
 
     name: str
     description: str
     required: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True)

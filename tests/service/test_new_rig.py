@@ -81,6 +81,10 @@ def test_a_parameter_is_shown_with_the_value_that_it_must_have():
     view = next(one for one in new_rig_view().profiles if one.name == "siemens/g120")
     required = {one.name: one.required for one in view.parameters}
     assert required["parameters.control_mode"] == "20" and required["parameters.reference_torque"] == ""
+    assert required["parameters.monitoring_time"] == "at least 0.4 s"       # the drive's own display has ms
+    units = {one.name: one.unit for one in view.parameters}
+    assert units["parameters.reference_torque"] == "N·m" and units["parameters.control_mode"] == ""
+    assert "p2040 monitoring time of the field bus: at least 0.4 s" in view.by_hand
 
 
 def fields_of(**changed):

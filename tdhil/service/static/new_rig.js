@@ -68,7 +68,7 @@
     function profileChanged() {
       const one = chosen();
       show(byId("address"), ...one.address.map((key) => input(`address.${key.name}`, place(key))));
-      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, tr("{quantity}, as read at the drive", { quantity: word(key.description) }), key.required && tr("required: {value}", { value: key.required }))));
+      show(byId("parameters"), ...one.parameters.map((key) => input(key.name, tr("{quantity}, as read at the drive", { quantity: word(key.description) }) + (key.unit && `, ${key.unit}`), key.required && tr("required: {value}", { value: key.required }))));
       byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it has been reported yet.") : "";
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
