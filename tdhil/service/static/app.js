@@ -3,6 +3,7 @@
 (() => {
   const { byLabels, english, errorText, fixed, local, point, precise, tick, tr, word, worded } = window.tdhilLanguage;
   const API = "/api/v1";
+  const PACE_S = 3;            // shortest time in which the pace of a simulated run is measured
   const SILENT_MS = 2000;      // without an answer in this time, a stop counts as not delivered and values as old
   const UNDELIVERED = tr("NOT DELIVERED: use the hard-wired stop");
   const ENDED = ["done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"];
@@ -662,15 +663,26 @@
       }));
     }
 
+    let began = null;
+    /** Seconds of the run in a second of the clock: more than 1 in stepped time; null before it is known. */
+    function pace() {
+      if (!status.simulated) return 1;
+      if (timeS === null) return null;
+      began ||= { clock: Date.now(), timeS };
+      const passed = (Date.now() - began.clock) / 1000;
+      return passed > PACE_S && timeS > began.timeS ? (timeS - began.timeS) / passed : null;
+    }
+
+    /** Time that the run still takes, in seconds of the clock. */
     function leftS() {
-      if (!status || status.state !== "moving") return null;
-      const began = Math.max(0, ...Object.values(done).map((one) => one.end_s));
+      if (!status || status.state !== "moving" || pace() === null) return null;
+      const since = Math.max(0, ...Object.values(done).map((one) => one.end_s));
       let left = 0, after = false;
       for (const [name, expected] of Object.entries(status.expected_s)) {
-        if (name === status.stage) { after = true; left += Math.max(0, expected - Math.max(0, (timeS ?? began) - began)); }
+        if (name === status.stage) { after = true; left += Math.max(0, expected - Math.max(0, (timeS ?? since) - since)); }
         else if (after && !done[name]) left += expected;
       }
-      return left;
+      return left / pace();
     }
 
     function state() {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from typing import Any
 
@@ -147,6 +148,34 @@ def test_a_stop_that_nobody_hears_says_so(page, served, way):
     if way == "offline":
         page.get_by_text("requesting …").wait_for(state="hidden")
     assert served.service.store.status(run).stop.asked is None
+
+
+def test_the_time_left_of_a_simulated_run_is_that_of_the_clock(page, served):
+    """In stepped time, ten seconds of the run pass in one: 60 s of it are 6 s at the desk."""
+    run, sockets = begin(served), []
+    status = json.loads((served.service.store.place(run) / "state.json").read_bytes()) | {
+        "simulated": True, "stage": "acquire", "expected_s": {"acquire": 100.0}}
+
+    def tell(time_s: float, kind: str = "news") -> None:
+        sockets[-1].send(json.dumps({"type": kind, "age_s": 0.1, "time_s": time_s, "status": status}))
+
+    def take(socket: Any) -> None:              # playwright marks its handler, which a method of a list does not allow
+        sockets.append(socket)
+
+    page.clock.install()
+    page.route_web_socket("**/live/*", take)
+    page.goto(f"/runs/{run}/live")
+    wait_for("the page", lambda: page.evaluate("1") and sockets)
+    tell(0.0, "hello")
+    page.get_by_text("moving").first.wait_for()
+    page.clock.run_for(1000)
+    assert page.locator("#left").inner_text() == ""             # the pace is not yet known
+    page.clock.run_for(3000)
+    tell(40.0)
+    page.clock.run_for(500)
+    left = page.locator("#left")
+    left.get_by_text("about").wait_for()
+    assert 5.0 <= float(re.search(r"([\d.]+) s", left.inner_text())[1]) <= 8.0
 
 
 def test_values_grow_grey_once_nothing_comes(page, served):
