@@ -435,16 +435,17 @@ _WAYS = (
     _QuantityDistortion("frozen", "stays at its last value", lambda _: FrozenValue()),
     _QuantityDistortion("scale", "is multiplied by this", lambda v: Linear(factor(v)), "1.1", "FACTOR"),
     _QuantityDistortion("sign", "has the opposite sign", lambda _: Linear(-1.0)),
-    _QuantityDistortion("offset", "is larger by this (rad/s, N·m, rad)", lambda v: Linear(1.0, _amount(v)), "1",
+    _QuantityDistortion("offset", "is larger by this, in {unit}", lambda v: Linear(1.0, _amount(v)), "1",
                         "AMOUNT"),
     _QuantityDistortion("delay", "comes so much later", lambda v: DelayedValue(seconds(v)), "500ms", "TIME"),
-    _QuantityDistortion("coarse", "has only multiples of this (rad/s, N·m, rad)", lambda v: Coarse(_step(v)), "1",
+    _QuantityDistortion("coarse", "has only multiples of this, in {unit}", lambda v: Coarse(_step(v)), "1",
                         "STEP"),
 )
 _QUANTITIES = {
     Feedback.SPEED: "the reported speed", Feedback.TORQUE: "the reported torque",
     Feedback.DEMAND: "the reported torque demand", Feedback.POSITION: "the reported position",
 }
+_UNITS = {Feedback.SPEED: "rad/s", Feedback.TORQUE: "N·m", Feedback.DEMAND: "N·m", Feedback.POSITION: "rad"}
 _ALL = tuple(Feedback)
 _ROW_OF = {Feedback.SPEED: 116, Feedback.TORQUE: 118, Feedback.POSITION: 119}
 """Row of the fault table for a quantity that is reported wrong. The torque demand has none."""
@@ -452,12 +453,13 @@ _ROW_OF = {Feedback.SPEED: 116, Feedback.TORQUE: 118, Feedback.POSITION: 119}
 
 def _of_value(signal: Feedback, words: str, way: _QuantityDistortion) -> ReportFault:
     row = 117 if (signal, way.name) == (Feedback.SPEED, "scale") else _ROW_OF.get(signal, 0)
-    return ReportFault(f"{signal.value}-{way.name}", f"{words} {way.text}",
+    return ReportFault(f"{signal.value}-{way.name}", f"{words} {way.text.format(unit=_UNITS[signal])}",
                        lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes, row)
 
 
 def _of_sensor(way: _QuantityDistortion) -> ReportFault:
-    return ReportFault(f"sensor-{way.name}", f"the drive's own speed sensor {way.text}; control and position follow it",
+    text = way.text.format(unit=_UNITS[Feedback.SPEED])
+    return ReportFault(f"sensor-{way.name}", f"the drive's own speed sensor {text}; control and position follow it",
                        lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes, 115)
 
 
