@@ -68,7 +68,7 @@ def dry_run_case(
 def _dry_run_steps(
     options: RunOptions, rig: Rig | None, case: StepCase, simulated: bool, rate_hz: float
 ) -> int:
-    program, limits = plan_dry_steps(case, rig, simulated, rate_hz)
+    program, limits = plan_dry_steps(case, rig, simulated, rate_hz, options.highest_speed_rad_s)
     step_torque_nm = case.gains.gain_nm_s_rad * program.step_rad_s
     plain = {
         "dry_run": True, "gains": case.kind, "rate_hz": rate_hz, "pairs": program.pairs,
@@ -99,7 +99,7 @@ def _dry_run_steps(
 def _dry_run_course(
     options: RunOptions, rig: Rig | None, case: EvaluationCase, simulated: bool, rate_hz: float
 ) -> int:
-    program, limits = plan_course(case, rig, simulated, rate_hz)
+    program, limits = plan_course(case, rig, simulated, rate_hz, options.highest_speed_rad_s)
     ratio, moving_torque_nm = case.rig.gear_ratio, program.peak_nm * case.scale
     plain = {
         "dry_run": True, "controller": case.prediction.kind, "rate_hz": rate_hz,

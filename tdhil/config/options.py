@@ -288,6 +288,12 @@ class RunOptions:
         unset="planned", form=Form("Mean speed", ("acquire",)),
         ge=-1e5, le=1e5, help="mean speed, such as 4 or 40rpm", more="mean speed",
     )
+    highest_speed_rad_s: float | None = option(
+        "--highest-speed", "run.highest_speed_rad_s", group=Topic.MOTION, unit=SPEED, metavar="RAD_S", api=True,
+        unset="that of the limits", form=Form("Highest speed of this run", ("acquire",)), ge=1e-6, le=1e5,
+        help="highest speed of this run in each stage, such as 3 or 30rpm; at most limits.speed_max_rad_s",
+        more="highest speed of the run in each stage, below that of `limits`, for a careful first motion",
+    )
     periods: int | None = option(
         "--periods", "run.periods", group=Topic.MOTION, metavar="N", api=True, unset="planned", ge=1, le=10_000,
         form=Form("Periods at each mean speed", ("acquire",)), help="periods per mean speed, settling included",

@@ -7,7 +7,9 @@ from collections.abc import Collection
 from typing import Any
 
 from drivers import Identity
+from profiles import MessageCode
 from tdhil.config import Rig, RunOptions, require_limits, rig_model, simulated_default_rig
+from tdhil.errors import UsageError
 from tdhil.recording import LagPrior, Pipe
 from tdhil.runner import ExcitationRequest, MachineLimits
 
@@ -64,16 +66,22 @@ UNKNOWN_LAG_SD_SHARE = 0.1
 """Standard deviation, as a share, of a lag that is stated without one."""
 
 
-def bench_of(identity: Identity, rig: Rig | None) -> Rig:
+def bench_of(identity: Identity, rig: Rig | None, highest_speed_rad_s: float | None = None) -> Rig:
     """Return the bench for this peer. A real one needs the limits of rig.yaml, a simulated one has its own.
 
-    Raises PreflightRefused without limits.
+    ``highest_speed_rad_s``: of this run. Raises PreflightRefused without limits, UsageError if it is not within them.
     """
-    if identity.simulated:
-        return simulated_default_rig(rig)
-    require_limits(rig)
-    assert rig is not None
-    return rig
+    bench = simulated_default_rig(rig) if identity.simulated else rig
+    limits = require_limits(bench)
+    assert bench is not None
+    if highest_speed_rad_s is None:
+        return bench
+    if not limits.speed_min_rad_s < highest_speed_rad_s <= limits.speed_max_rad_s:
+        raise UsageError(
+            f"{highest_speed_rad_s:.4g} rad/s is not within the limits of the rig, {limits.speed_min_rad_s:g} to "
+            f"{limits.speed_max_rad_s:g} rad/s", where="--highest-speed", next_step="Choose a speed between them",
+            entry=MessageCode.VALUE_NOT_ALLOWED)
+    return bench.model_copy(update={"limits": limits.model_copy(update={"speed_max_rad_s": highest_speed_rad_s})})
 
 
 def machine_limits(

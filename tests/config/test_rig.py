@@ -38,8 +38,8 @@ drive_data:
   torque_scale_rel_sd: 0.03
   speed_lag_s: 0.4
   speed_lag_sd_s: 0.02
-reference_inertia_kg_m2: 104
 run:
+  highest_speed_rad_s: 9
   excitation: sine
   mode: speed
   frequency_hz: 0.3
@@ -67,6 +67,7 @@ run:
 accept_unverified: [watchdog, likely]
 modbus: {host: 192.0.2.10, port: 5020, unit: 7}
 letterhead: letterhead.yaml
+reference_inertia_kg_m2: 104
 """
 
 

@@ -765,8 +765,8 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
     assert service.supervisor.live() == []
 
 
-MOTION = {"mode", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "periods", "realisations", "rate_hz", "model",
-          "confidence"}
+MOTION = {"mode", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "highest_speed_rad_s", "periods", "realisations",
+          "rate_hz", "model", "confidence"}
 
 
 @pytest.mark.parametrize(("path", "fields"), [
@@ -816,13 +816,16 @@ def test_the_start_form_shows_the_expected_values_of_the_rig_s_file(client, rigs
     assert "The rig&#39;s file expects inertia=104 kg·m² ± 5 %, coulomb=60 N·m ± 9 N·m." in page
 
 
-def test_the_start_page_names_the_speeds_of_stage_2_which_no_field_of_the_form_changes(client, rigs):
+def test_the_start_page_names_the_speeds_of_stage_2_with_the_limits_and_of_a_first_motion(client, rigs):
     limits = machine_limits(load_rig(rigs / "real.yaml"))
     page = client.get("/start/real").text
-    first, table = page.index('id="first"'), page.index("speeds of stage 2")
-    for part in (page[first:], page[table:]):
-        shown = re.findall(r'data-speed="([^"]+)"', part)[:2]
-        assert [float(one) for one in shown] == pytest.approx(mean_speeds(limits))
+    highest_rad_s = float(re.search(r'id="first" data-highest="([^"]+)"', page)[1])
+    width = limits.speed_max_rad_s - limits.speed_min_rad_s
+    assert highest_rad_s == pytest.approx(limits.speed_min_rad_s + 0.4 * width)
+    careful = dataclasses.replace(limits, speed_max_rad_s=highest_rad_s)
+    for where, of in (('id="first"', careful), ("speeds of stage 2", limits)):
+        shown = re.findall(r'data-speed="([^"]+)"', page[page.index(where):])[:2]
+        assert [float(one) for one in shown] == pytest.approx(mean_speeds(of))
 
 
 def test_an_empty_field_shows_an_example_as_an_example(client):

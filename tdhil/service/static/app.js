@@ -427,13 +427,10 @@
 
   /** The first run of a new rig: its steps, and a motion in the lower part of the speed window. */
   function firstMotion(form, steps) {
-    const low = Number(steps.dataset.low), width = Number(steps.dataset.high) - low;
     steps.hidden = false;
-    for (const [name, value] of [["offset_rad_s", low + 0.25 * width], ["amplitude_rad_s", 0.1 * width]]) {
-      const field = form.elements[name];
-      if (!field.value) field.value = local(String(Number(inSpeedUnit(value).toPrecision(3))));
-      opens(field);
-    }
+    const field = form.elements.highest_speed_rad_s;
+    if (!field.value) field.value = local(String(Number(inSpeedUnit(Number(steps.dataset.highest)).toPrecision(3))));
+    opens(field);
   }
 
   const CHECK_MS = 130000;     // the service ends a check after 120 s

@@ -167,8 +167,8 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     page.get_by_role("button", name="Start: preflight, then the code").wait_for()
     page.get_by_role("heading", name="First motion of this rig").wait_for()          # its steps, and a careful plan
     page.get_by_text("The shaft moves for the first time: at most 200 N·m and 3 rad.").wait_for()
-    filled = [page.locator(f"[name={name}_rad_s]").input_value() for name in ("offset", "amplitude")]
-    assert filled == ["27.5", "9"]                     # rpm, as the switch says: 2.88 and 0.942 rad/s
+    assert page.locator("[name=highest_speed_rad_s]").input_value() == "41"    # rpm, as the switch says: 4.29 rad/s
+    page.get_by_text("The shaft turns at 14 and then at 30.2 rpm.").wait_for()
     checks = [{"grade": grade, "name": HOSTILE, "said": HOSTILE, "do": do} for grade, do in
               (("ok", ""), ("note", ""), ("bad", "Choose its own profile"))]
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, sent: {"document": {"checks": checks}})

@@ -1,0 +1,48 @@
+"""Limits of a run: those of the rig, and a lower highest speed for one run."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from drivers import Identity
+from tdhil.cli.main import main
+from tdhil.config import simulated_default_rig
+from tdhil.errors import ExitCode, UsageError
+from tdhil.session.task import bench_of, machine_limits
+
+REAL, SIMULATED = (Identity(1, 2, 3, 4, "", simulated) for simulated in (False, True))
+
+
+@pytest.mark.parametrize("identity", [REAL, SIMULATED])
+def test_a_run_may_have_a_lower_highest_speed_and_nothing_else_changes(identity):
+    rig = simulated_default_rig(None)
+    usual, careful = machine_limits(bench_of(identity, rig)), machine_limits(bench_of(identity, rig, 4.0))
+    assert (usual.speed_max_rad_s, careful.speed_max_rad_s) == (10.0, 4.0)
+    assert {name for name in vars(usual) if getattr(usual, name) != getattr(careful, name)} == {"speed_max_rad_s"}
+    assert rig.limits.speed_max_rad_s == 10.0
+
+
+@pytest.mark.parametrize("speed_rad_s", [10.5, 0.5, 0.1])
+def test_no_run_exceeds_the_limits_of_the_rig(speed_rad_s):
+    with pytest.raises(UsageError, match=r"--highest-speed: .* is not within the limits of the rig, 0.5 to 10 rad/s"):
+        bench_of(REAL, simulated_default_rig(None), speed_rad_s)
+
+
+def test_the_plan_stays_below_the_highest_speed_of_the_run(capsys):
+    assert main(["identify", "--simulate", "--highest-speed", "4", "--dry-run", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["limits"]["speed_max_rad_s"] == 4.0 and plan["speed_rad_s"]["max"] < 4.0
+    assert main(["identify", "--simulate", "--highest-speed", "100rpm", "--dry-run"]) == ExitCode.USAGE
+
+
+@pytest.mark.heavy
+def test_no_stage_of_a_run_exceeds_its_highest_speed(tmp_path, capsys):
+    trace = tmp_path / "shaft.csv"
+    assert main(["identify", "--simulate", "--seed", "3", "--highest-speed", "4", "--trace", str(trace), "--log",
+                 str(tmp_path / "run.mcap"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["inertia_kg_m2"]["low_total"] < 104.0 < found["inertia_kg_m2"]["high_total"]
+    speeds = [float(line.split(",")[1]) for line in trace.read_text(encoding="utf-8").splitlines()[1:]]
+    assert 3.0 < max(speeds) < 4.0
