@@ -170,10 +170,12 @@ def verify_steps(
                                 "needed", (), number, inf, 0.0, time_s, mean, expected, expected)
     scatter = pairs - mean
     whiten = _whitening(scatter)
-    # The whole response leads near the minimum; its coloured noise decides there.
+    # The whole response leads near the minimum; its coloured noise decides there. If it led to another minimum, the fit
+    # from the prediction is the better one.
     weight = sqrt(number) / max(float(scatter.std()), _LEAST_SD)
     near, _ = _fitted(model, mean, lambda x: weight * x, start)
-    theta, slopes = _fitted(model, mean, whiten, near)
+    theta, slopes = min((_fitted(model, mean, whiten, at) for at in (near, start)),
+                        key=lambda fit: _cost(model, whiten(mean - model.reported(fit[0])), fit[0]))
     prior = np.diag(model.prior)
     inverse = np.linalg.inv(slopes.T @ slopes + prior)
     fitted = model.reported(theta)

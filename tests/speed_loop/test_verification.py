@@ -23,6 +23,7 @@ from tdhil.speed_loop import (
     step_case_of,
     step_length_s,
     step_pairs,
+    verification,
     verify_record,
     verify_steps,
 )
@@ -168,6 +169,21 @@ def test_a_coupling_above_the_excited_lines_does_not_bend_the_gains():
         assert rows[name].measured.low < true < rows[name].measured.high
         assert rows[name].measured.value == pytest.approx(true, rel=0.06)
     assert result.misfit_p > 0.01
+
+
+def test_the_fit_from_the_prediction_counts_where_the_other_one_ends_in_another_minimum(monkeypatch):
+    """Seed 100113 of `benchmarks/speed_loop_verify.py`: the fit of the whole response led to these parameters."""
+    whole = verification._fitted
+    elsewhere = np.array([-0.23, -0.26, -6.02, 6.48, 5.36, 0.12, 1.26, 0.22, 3.73, 0.05, -0.33])
+
+    def fitted(model, mean, whiten, theta):
+        found, slopes = whole(model, mean, whiten, theta)
+        return (elsewhere, slopes) if len(ended) < 2 else (found, slopes)
+
+    ended = []
+    monkeypatch.setattr(verification, "_fitted", lambda *known: (fitted(*known), ended.append(known))[0])
+    result = found(responses(CASE.gains))
+    assert len(ended) == 3 and result.outcome is StepOutcome.AGREES, result.reason
 
 
 def test_too_few_pairs_state_how_many_are_needed_and_these_are_enough():
