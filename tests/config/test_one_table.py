@@ -214,6 +214,7 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "runner/speed_check.py": ("advice in a refusal, as a flag to type", {"--accept-speed-unit"}),
     "runner/stages/impedance.py": ("the motion that this stage makes", {"multisine"}),
     "session/confirm.py": ("advice in a refusal, as a flag to type", {"--accept-speed-unit"}),
+    "session/task.py": ("the place of a mistake, as a flag to type", {"--highest-speed"}),
     "session/overrides.py": ("decides what this option means", {"accept_unverified"}),
     "service/access.py": ("what an engineer alone may ask for: a rule of roles",
                           {"accept_unverified", "accept_wider_limit", "accept_speed_unit"}),
@@ -232,10 +233,10 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "studies/paper/loop.py": ("the paper's own motions", {"multisine", "sine"}),
     "studies/paper/sweeps.py": ("the paper's own motions", {"sine"}),
     "service/static/app.js": (
-        "a role, signals of the plots, the key of a sign-off, the clock that a page measures, values in a text, the two"
-        " fields that a careful first motion fills", {
-            "amplitude_rad_s", "drive", "excitation", "mode", "note", "offset_rad_s", "operator", "place", "step",
-            "speed", "torque", "real_time"}),
+        "a role, signals of the plots, the key of a sign-off, the clock that a page measures, values in a text, the"
+        " field that a careful first motion fills", {
+            "drive", "excitation", "highest_speed_rad_s", "mode", "note", "operator", "place", "step", "speed",
+            "torque", "real_time"}),
     "service/static/results.js": (
         "a rehearsal's request; keys of answers; a role; a column of the friction table and of a chart's CSV; the type"
         " of a value", {
