@@ -118,7 +118,7 @@ def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
     from tdhil.runner import Task
     from tdhil.session import bench_of, excitation_request, facts, machine_limits
 
-    bench = bench_of(identity, rig)
+    bench = bench_of(identity.simulated, rig)
     return Task(machine_limits(bench), excitation_request(options), facts(bench))
 
 

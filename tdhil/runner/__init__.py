@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     )
     from tdhil.runner.settings import (
         ControlAssumptions as ControlAssumptions, ExcitationRequest as ExcitationRequest,
-        MachineLimits as MachineLimits, StopRequest as StopRequest,
+        MEAN_SPEED_SHARES as MEAN_SPEED_SHARES, MachineLimits as MachineLimits, StopRequest as StopRequest,
     )
     from tdhil.runner.speed_check import speed_warnings as speed_warnings
     from tdhil.runner.stage_log import stage_warnings as stage_warnings
@@ -43,7 +43,7 @@ else:
         "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless refuse_undersampled"
         " refuse_uninformative",
         "preconditions": "precondition_warnings refuse_by_plan stops_from_torque_mode",
-        "settings": "ControlAssumptions ExcitationRequest MachineLimits StopRequest",
+        "settings": "ControlAssumptions ExcitationRequest MEAN_SPEED_SHARES MachineLimits StopRequest",
         "speed_check": "speed_warnings",
         "stage_log": "stage_warnings",
         "stages": "course_of plan_steps_before",

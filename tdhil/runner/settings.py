@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 from tdhil.config import DEFAULT_EXCITATION
 from tdhil.errors import Interrupted
 
+MEAN_SPEED_SHARES = 0.25, 0.7
+"""Two mean speeds of the operating points of stage 2, as shares of the speed window."""
+
 
 @dataclass(frozen=True)
 class MachineLimits:

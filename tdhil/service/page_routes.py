@@ -20,6 +20,7 @@ from starlette.routing import BaseRoute, Route
 from tdhil.config import OPTION, STATED, Option, Origin, Setting, form_options
 from tdhil.errors import TdhilError
 from tdhil.report import GRAPHS
+from tdhil.runner import MEAN_SPEED_SHARES
 from tdhil.service.access import principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.api_page import api_page
@@ -91,11 +92,10 @@ class Pages:
                 trim_blocks=True, lstrip_blocks=True)
             found.globals.update(
                 version=__version__, stop_s=STOP_S, form_options=form_options,
-                stated_options=[OPTION[name] for name in STATED],
-                language=language, languages=self._languages.values(),
+                stated_options=[OPTION[name] for name in STATED], language=language, languages=self._languages.values(),
                 graphs=GRAPHS, kept=self._kept.__getitem__, _=language.text, word=language.word,
                 hint=partial(_applies, language, settings={}), applies=partial(_applies, language),
-                about=partial(_about, language),
+                about=partial(_about, language), stage_2=MEAN_SPEED_SHARES,
                 code=Markup("<code>{}</code>").format, strong=Markup("<strong>{}</strong>").format,
                 speed_unit=Markup("<span data-speed-unit>rad/s</span>"))
             found.filters["number"] = language.number

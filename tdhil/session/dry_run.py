@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from drivers import Identity, PreflightRefused
+from drivers import PreflightRefused
 from profiles import MessageCode
 from tdhil.config import Rig, RunOptions
 from tdhil.session.task import bench_of, excitation_request, lag_prior, machine_limits
@@ -51,7 +51,7 @@ def plan_dry(
     from tdhil.runner import plan_acquisition, refuse_by_plan
     from tdhil.runner.excitation import PlanRefused
 
-    bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig, options.highest_speed_rad_s)
+    bench = bench_of(simulated, rig, options.highest_speed_rad_s)
     limits = machine_limits(bench)
     # A quick stop that ends with the drive off releases a string.
     refuse_by_plan(limits, excitation_request(options), profile.quick_stop.ends == "off")
@@ -77,7 +77,7 @@ def plan_course(
     """Return the speed program of a virtual string, and the machine's limits. Raises an error if they do not fit."""
     from tdhil.runner import ControlAssumptions, Guard, course_of
 
-    limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig, highest_speed_rad_s))
+    limits = machine_limits(bench_of(simulated, rig, highest_speed_rad_s))
     assumptions = ControlAssumptions().at_period(1.0 / rate_hz)
     return course_of(case, limits, 1.0 / rate_hz, Guard.foresight_s(assumptions)), limits
 
@@ -91,7 +91,7 @@ def plan_dry_steps(
     """
     from tdhil.runner import plan_steps_before
 
-    limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig, highest_speed_rad_s))
+    limits = machine_limits(bench_of(simulated, rig, highest_speed_rad_s))
     return plan_steps_before(case, limits, 1.0 / rate_hz, 0.0), limits
 
 
@@ -129,7 +129,7 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, profile: Profile) -> N
     from tdhil.runner import refuse_hopeless as refuse_hopeless_plan
     from tdhil.runner.excitation import PlanRefused
 
-    bench = bench_of(Identity(0, 0, 0, 0, "", True), rig, options.highest_speed_rad_s)
+    bench = bench_of(True, rig, options.highest_speed_rad_s)
     limits = machine_limits(bench)
     modes = (options.mode,) if options.mode else ("torque", "speed") if _can_torque(profile, limits) else ("speed",)
     guess, known, _ = _assumed(bench, limits)

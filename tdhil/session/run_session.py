@@ -259,7 +259,7 @@ class RunSession:
     def _task(self, identity: Identity) -> Task:
         request, log = self._request, self.log
         profile, overrides, accepted = request.connection.profile, request.overrides, request.options.accept_unverified
-        bench = bench_of(identity, request.rig, request.options.highest_speed_rad_s)
+        bench = bench_of(identity.simulated, request.rig, request.options.highest_speed_rad_s)
         log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
         refuse_another_drive(log.run, asdict(identity))
         if not identity.simulated:

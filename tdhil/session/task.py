@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection
 from typing import Any
 
-from drivers import Identity
 from profiles import MessageCode
 from tdhil.config import Rig, RunOptions, require_limits, rig_model, simulated_default_rig
 from tdhil.errors import UsageError
@@ -66,12 +65,12 @@ UNKNOWN_LAG_SD_SHARE = 0.1
 """Standard deviation, as a share, of a lag that is stated without one."""
 
 
-def bench_of(identity: Identity, rig: Rig | None, highest_speed_rad_s: float | None = None) -> Rig:
+def bench_of(simulated: bool, rig: Rig | None, highest_speed_rad_s: float | None = None) -> Rig:
     """Return the bench for this peer. A real one needs the limits of rig.yaml, a simulated one has its own.
 
     ``highest_speed_rad_s``: of this run. Raises PreflightRefused without limits, UsageError if it is not within them.
     """
-    bench = simulated_default_rig(rig) if identity.simulated else rig
+    bench = simulated_default_rig(rig) if simulated else rig
     limits = require_limits(bench)
     assert bench is not None
     if highest_speed_rad_s is None:

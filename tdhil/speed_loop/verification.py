@@ -174,8 +174,11 @@ def verify_steps(
     # from the prediction is the better one.
     weight = sqrt(number) / max(float(scatter.std()), _LEAST_SD)
     near, _ = _fitted(model, mean, lambda x: weight * x, start)
-    theta, slopes = min((_fitted(model, mean, whiten, at) for at in (near, start)),
-                        key=lambda fit: _cost(model, whiten(mean - model.reported(fit[0])), fit[0]))
+
+    def cost(at: Reals) -> float:
+        return _cost(model, whiten(mean - model.reported(at)), at)
+
+    theta, slopes = min((_fitted(model, mean, whiten, at) for at in (near, start)), key=lambda fit: cost(fit[0]))
     prior = np.diag(model.prior)
     inverse = np.linalg.inv(slopes.T @ slopes + prior)
     fitted = model.reported(theta)
@@ -192,7 +195,7 @@ def verify_steps(
     birge = max(1.0, squares / max(float(np.mean(left)), 1e-18))
     moves = scatter @ slopes @ inverse
     covariance = birge * moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
-    rows = _rows(model, _possible(model, mean, whiten, theta, covariance, birge), covariance, number)
+    rows = _rows(model, _possible(theta, covariance, cost, birge), covariance, number)
     amplitude = abs(model.rounding_amplitude(theta)) if model.counts < FEW_COUNTS else 0.0
     alike = amplitude > (ROUNDED_AMPLITUDE if chance < UNLIKE_P else QUIET_AMPLITUDE)
     outcome, reason = _judged(rows, rms, chance, limited=limited, rounded_alike=alike)
@@ -263,9 +266,7 @@ def _cost(model: StepModel, whitened: Reals, theta: Reals) -> float:
     return float((whitened**2).sum()) + float((model.prior * theta**2).sum())
 
 
-def _possible(
-    model: StepModel, mean: Reals, whiten: Callable[[Reals], Reals], theta: Reals, covariance: Reals, birge: float
-) -> list[Reals]:
+def _possible(theta: Reals, covariance: Reals, cost: Callable[[Reals], float], birge: float) -> list[Reals]:
     """Return the fitted parameters, and random draws around them without those that the response excludes.
 
     The covariance is that of small changes. A coupling of low frequency changes the response more than its slope at
@@ -274,8 +275,8 @@ def _possible(
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(variances, 0.0))
     draws = theta + np.random.default_rng(1).standard_normal((_DRAWS, len(theta))) @ root.T
-    most = _cost(model, whiten(mean - model.reported(theta)), theta) + _EXCLUDED * birge
-    return [theta, *(one for one in draws if _cost(model, whiten(mean - model.reported(one)), one) <= most)]
+    most = cost(theta) + _EXCLUDED * birge
+    return [theta, *(one for one in draws if cost(one) <= most)]
 
 
 def _slopes(model: StepModel, theta: Reals, now: Reals) -> Reals:

@@ -24,7 +24,7 @@ from tdhil.estimation import (
 from tdhil.recording import FloatArray, Level, Ramp
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
-from tdhil.runner.settings import ControlAssumptions, MachineLimits
+from tdhil.runner.settings import MEAN_SPEED_SHARES, ControlAssumptions, MachineLimits
 from tdhil.runner.speed_check import SpeedUnitCheck, SpeedWitness
 from tdhil.runner.stages.steady import (
     SteadyLevel,
@@ -115,7 +115,8 @@ class SpeedResult:
 def mean_speeds(limits: MachineLimits) -> tuple[float, float]:
     """Return the two mean speeds of the operating points, rad/s."""
     span = limits.speed_max_rad_s - limits.speed_min_rad_s
-    return limits.speed_min_rad_s + 0.25 * span, limits.speed_min_rad_s + 0.7 * span
+    low, high = MEAN_SPEED_SHARES
+    return limits.speed_min_rad_s + low * span, limits.speed_min_rad_s + high * span
 
 
 def run_speed(
