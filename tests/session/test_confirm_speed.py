@@ -90,19 +90,18 @@ def test_a_terminal_that_takes_nothing_holds_no_cycle_up(monkeypatch):
 @pytest.mark.skipif(sys.platform == "win32", reason="no such terminals there")
 def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
     operator, terminal = os.openpty()
-    cycles = []
+    shown, answered = io.StringIO(), []
 
     def idle():
-        cycles.append(1)
         time.sleep(0.001)
-        if len(cycles) == 50:
-            os.write(operator, b"no\n")
+        if "yes and Enter" in shown.getvalue() and not answered:    # after the question
+            answered.append(os.write(operator, b"no\n"))
 
     with os.fdopen(terminal, encoding="utf-8") as stdin, os.fdopen(operator, "wb", buffering=0):
         monkeypatch.setattr(sys, "stdin", stdin)
         os.write(operator, b"yes\n")
         with pytest.raises(PreflightRefused, match="did not confirm that the shaft turns"):
-            confirm_speed(1.0, "", idle, console=Console(file=io.StringIO()), pause_display=lambda: None)
+            confirm_speed(1.0, "", idle, console=Console(file=shown, width=200), pause_display=lambda: None)
 
 
 def test_no_terminal_at_all(monkeypatch):
