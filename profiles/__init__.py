@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from profiles.entry import (
         Confidence as Confidence, DriveProfile as DriveProfile, ProfileEntry as ProfileEntry, Require as Require,
         NotchParameter as NotchParameter, SpeedControllerParameters as SpeedControllerParameters,
+        unit_text as unit_text, with_unit as with_unit,
     )
     from profiles.errors import (
         DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError, UsageError as UsageError,
@@ -44,7 +45,8 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "eds_import": "begin_profile",
         "eds_reader": "read_eds",
-        "entry": "Confidence DriveProfile NotchParameter ProfileEntry Require SpeedControllerParameters",
+        "entry": "Confidence DriveProfile NotchParameter ProfileEntry Require SpeedControllerParameters unit_text "
+                 "with_unit",
         "errors": "DataFileError Problem TdhilError UsageError",
         "library": "Profile eds_path load_canopen_profile load_ethercat_profile load_modbus_profile load_profile "
                    "matching_names parse_profile profile_names profile_text",

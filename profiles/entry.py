@@ -1,8 +1,8 @@
 """Fields of every section of a profile: its source, and the confidence in it."""
 
 
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Final, Literal, Protocol, Self, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -27,6 +27,45 @@ class Require(DataModel):
         if all(value is None for value in (self.equals, self.one_of, self.at_least, self.at_most)):
             refuse_if([("", "say equals, one_of, at_least or at_most")])
         return self
+
+    def met_by(self, value: float, slack: float) -> bool:
+        """Return whether the value meets each part of the requirement. ``slack``: permitted difference."""
+        return (
+            (self.equals is None or abs(value - self.equals) <= slack)
+            and (self.one_of is None or any(abs(value - one) <= slack for one in self.one_of))
+            and (self.at_least is None or value >= self.at_least - slack)
+            and (self.at_most is None or value <= self.at_most + slack)
+        )
+
+    def text(self, show: Callable[[float], str]) -> str:
+        """Return the requirement in words. ``show``: returns a value with its unit."""
+        parts = []
+        if self.equals is not None:
+            parts.append(show(self.equals))
+        if self.one_of is not None:
+            parts.append(" or ".join(show(one) for one in self.one_of))
+        if self.at_least is not None:
+            parts.append(f"at least {show(self.at_least)}")
+        if self.at_most is not None:
+            parts.append(f"at most {show(self.at_most)}")
+        return ", ".join(parts)
+
+    def text_in(self, unit: str) -> str:
+        """Return the requirement in words, with values in this unit of the schema."""
+        return self.text(lambda value: with_unit(value, unit))
+
+
+_UNIT_TEXTS: Final = {"rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "hz": "Hz", "kw": "kW", "none": ""}
+
+
+def unit_text(unit: str) -> str:
+    """Return the unit of a drive's parameter as in texts; "" for a number without a unit."""
+    return _UNIT_TEXTS.get(unit, unit)
+
+
+def with_unit(value: float, unit: str) -> str:
+    """Return the value of a drive's parameter with its unit."""
+    return f"{value:.10g} {unit_text(unit)}".strip()
 
 
 # ---------------------------------------------------------------------------------------------------------------------

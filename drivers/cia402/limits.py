@@ -11,16 +11,16 @@ from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
-from profiles import Require
+from profiles import Require, with_unit
 from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile, Parameter
 
 QUICK_STOP_OPTION = 0x605A
 
+FLOAT_ROUNDING = 1e-6
+"""Permitted relative difference of a value from the required one: above the rounding of a 32-bit float, 6e-8."""
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of the drive that the profile names: read, compared with the required values, and used as scales.
-
-
-_UNITS = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s", "hz": " Hz"}
 
 
 class DriveSettings:
@@ -68,41 +68,15 @@ def check_parameters(table: PreflightTable, objects: Objects, profile: Cia402Pro
     for one in profile.parameters:
         if one.require is None:
             continue
-        unit = _UNITS.get(one.unit, "")
 
-        def work(one: Parameter = one, unit: str = unit) -> tuple[str, bool]:
+        def work(one: Parameter = one, require: Require = one.require) -> tuple[str, bool]:
             value = settings.value(one.name)
-            return f"{value:.10g}{unit}", one.require is None or fulfils(one.require, value)
+            return with_unit(value, one.unit), require.met_by(value, FLOAT_ROUNDING * abs(value))
 
         table.attempt(
-            one.title, wanted_text(one.require, unit), name(one.index, one.sub), work,
+            one.title, one.require.text_in(one.unit), name(one.index, one.sub), work,
             one.advice or "Set it at the drive; tdhil does not write it",
         )
-
-
-def fulfils(require: Require, value: float) -> bool:
-    """Return whether ``value`` meets the requirement, within the rounding of a 32-bit float."""
-    slack = 1e-6 * abs(value)
-    exact = [wanted for wanted in (require.equals,) if wanted is not None] + list(require.one_of or ())
-    return (
-        (not exact or any(abs(value - wanted) <= slack for wanted in exact))
-        and (require.at_least is None or value >= require.at_least - slack)
-        and (require.at_most is None or value <= require.at_most + slack)
-    )
-
-
-def wanted_text(require: Require, unit: str) -> str:
-    """Return the requirement in words."""
-    parts = []
-    if require.equals is not None:
-        parts.append(f"{require.equals:.10g}{unit}")
-    if require.one_of is not None:
-        parts.append(" or ".join(f"{value:.10g}" for value in require.one_of) + unit)
-    if require.at_least is not None:
-        parts.append(f"at least {require.at_least:.10g}{unit}")
-    if require.at_most is not None:
-        parts.append(f"at most {require.at_most:.10g}{unit}")
-    return ", ".join(parts)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 from drivers.drive import DriveLimits, ReportingFilters, SpeedLoopPresent
@@ -17,10 +18,8 @@ from drivers.modbus.codec import RANGES, RPM, per_count, register_name, settle, 
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable, agreed_rated_torque, spare
 from drivers.speed_loop import ReadSetting, read_speed_loop
-from profiles import Require
+from profiles import unit_text
 from profiles.modbus import ModbusProfile, Parameter, Register
-
-UNITS = {"rpm": "rpm", "rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "s": "s", "hz": "Hz", "kw": "kW"}
 
 
 @dataclass(frozen=True)
@@ -97,25 +96,13 @@ def check_required(
             continue
         if value is None:
             continue        # refused already, where it was read
-        good = satisfied(require, value, _lsb(parameter, found.values))
+        good = require.met_by(value, 0.5 * _lsb(parameter, found.values))       # half a count
+        wanted = require.text(partial(show, parameter=parameter))
         if not good and parameter.name in spared:
-            spare(table, parameter.title, wanted_text(require, parameter), show(value, parameter), where_of(parameter))
+            spare(table, parameter.title, wanted, show(value, parameter), where_of(parameter))
             continue
-        advice = parameter.advice or f"Set '{parameter.title}' at the drive to {wanted_text(require, parameter)}"
-        table.row(
-            parameter.title, wanted_text(require, parameter), show(value, parameter), good, where_of(parameter), advice
-        )
-
-
-def satisfied(require: Require, value: float, lsb: float) -> bool:
-    """Return whether the value is within half a count of the requirement."""
-    half = 0.5 * lsb
-    return (
-        (require.equals is None or abs(value - require.equals) <= half)
-        and (require.one_of is None or any(abs(value - one) <= half for one in require.one_of))
-        and (require.at_least is None or value >= require.at_least - half)
-        and (require.at_most is None or value <= require.at_most + half)
-    )
+        advice = parameter.advice or f"Set '{parameter.title}' at the drive to {wanted}"
+        table.row(parameter.title, wanted, show(value, parameter), good, where_of(parameter), advice)
 
 
 def find_rated_torque(
@@ -204,21 +191,7 @@ def where_of(parameter: Parameter) -> str:
 def show(value: float, parameter: Parameter) -> str:
     """Return a value with its unit."""
     plain = f"{value:.0f}" if parameter.unit == "none" and value.is_integer() else f"{value:.6g}"
-    return f"{plain} {UNITS.get(parameter.unit, '')}".strip()
-
-
-def wanted_text(require: Require, parameter: Parameter) -> str:
-    """Return a requirement in words."""
-    parts = []
-    if require.equals is not None:
-        parts.append(show(require.equals, parameter))
-    if require.one_of is not None:
-        parts.append(" or ".join(show(one, parameter) for one in require.one_of))
-    if require.at_least is not None:
-        parts.append(f"at least {show(require.at_least, parameter)}")
-    if require.at_most is not None:
-        parts.append(f"at most {show(require.at_most, parameter)}")
-    return ", ".join(parts)
+    return f"{plain} {unit_text(parameter.unit)}".strip()
 
 
 def fits(parameter: Parameter, counts: int) -> bool:

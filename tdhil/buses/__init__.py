@@ -13,6 +13,6 @@ from tdhil.buses.doctor_finding import (
 )
 from tdhil.buses.profile_text import (
     MARKS as MARKS, counts as counts, facts_of as facts_of, modes_text as modes_text,
-    required_text as required_text, row as row, sure_text as sure_text, unit_text as unit_text,
+    row as row, sure_text as sure_text,
     watchdog_text as watchdog_text,
 )

@@ -31,11 +31,11 @@ from drivers import (
     TdhilError,
 )
 from drivers import modbus as driver
-from profiles import DataModel, Finding, Profile, ProfileEntry, load_profile, profile_names
+from profiles import DataModel, Finding, Profile, ProfileEntry, load_profile, profile_names, unit_text
 from profiles.modbus import BusLine, ModbusProfile, Parameter, Register
 from tdhil.buses.bus import Bus, Connection, FoundDrive, Line, Opening, PeerPlan, ProfileTable, ValueSeen, one_host
 from tdhil.buses.doctor_finding import DoctorFinding, attempted, bad, note, of_check, of_error, ok
-from tdhil.buses.profile_text import MARKS, unit_text, watchdog_text
+from tdhil.buses.profile_text import MARKS, watchdog_text
 from tdhil.config import DriveData, Origin, Rig, RunOptions, Setting, check_values
 from tdhil.errors import MessageCode, UsageError
 

@@ -7,18 +7,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from profiles import Confidence, Profile, ProfileEntry, Require
+from profiles import Confidence, Profile, ProfileEntry, unit_text
 from profiles.cia402 import Parameter
 from tdhil.buses.bus import ProfileTable
 
-_UNITS = {"rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "hz": "Hz", "kw": "kW", "none": ""}
 MARKS = {"verified": "", "likely": "likely", "unverified": "UNVERIFIED"}
 """Mark of an entry's confidence in a table."""
-
-
-def unit_text(unit: str) -> str:
-    """Return a unit of the schema as in texts."""
-    return _UNITS.get(unit, unit)
 
 
 def object_table(parameters: Sequence[Parameter]) -> ProfileTable:
@@ -73,20 +67,6 @@ def row(profile: Profile) -> dict[str, Any]:
         "entries": counts(profile),
         "experimental": profile.experimental,
     }
-
-
-def required_text(require: Require, unit: str) -> str:
-    """Return the required value of a parameter."""
-    parts = []
-    if require.equals is not None:
-        parts.append(f"{require.equals:.10g}")
-    if require.one_of is not None:
-        parts.append(" or ".join(f"{value:.10g}" for value in require.one_of))
-    if require.at_least is not None:
-        parts.append(f"at least {require.at_least:.10g}")
-    if require.at_most is not None:
-        parts.append(f"at most {require.at_most:.10g}")
-    return f"{', '.join(parts)} {unit}".strip()
 
 
 def facts_of(entry: ProfileEntry) -> Iterator[tuple[str, str, str]]:

@@ -7,17 +7,24 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles import DataFileError, Profile, ProfileEntry, eds_path, load_profile, matching_names, profile_names
+from profiles import (
+    DataFileError,
+    Profile,
+    ProfileEntry,
+    eds_path,
+    load_profile,
+    matching_names,
+    profile_names,
+    unit_text,
+)
 from tdhil.buses import (
     MARKS,
     bus_named,
     counts,
     facts_of,
     modes_text,
-    required_text,
     row,
     sure_text,
-    unit_text,
     watchdog_text,
 )
 from tdhil.cli.arguments import add_option
@@ -93,7 +100,7 @@ def _by_hand(profile: Profile, console: Console) -> None:
         table = _table("set by hand at the drive; a run is refused until they are read", "parameter", "must be", "do")
         for one in required:
             assert one.require is not None
-            needed = required_text(one.require, unit_text(one.unit))
+            needed = one.require.text_in(one.unit)
             table.add_row(one.title, needed, _advice(one, one in profile.untold))
         console.print(table)
     missing = [(f"parameters: {{{one.name}: …}}", one.title, unit_text(one.unit)) for one in profile.untold]

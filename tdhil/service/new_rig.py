@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers import CommunicationLost
-from profiles import DataFileError, Profile, load_profile, profile_names
-from tdhil.buses import FoundDrive, bus_named, required_text, unit_text
+from profiles import DataFileError, Profile, load_profile, profile_names, unit_text
+from tdhil.buses import FoundDrive, bus_named
 from tdhil.config import Limits, Rig, parse_rig
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.service.schemas import (
@@ -49,7 +49,7 @@ def _view(profile: Profile) -> ProfileView:
         profile.name, profile.title, profile.bus, bus_named(profile.bus).title, profile.experimental,
         by_hand(profile), {name: entry.source for name, entry in doubtful(profile)}, profile.rated_torque_by_hand,
         [FieldView(f"parameters.{one.name}", one.title,
-                   required_text(one.require, unit_text(one.unit)) if one.require else "", unit_text(one.unit))
+                   one.require.text_in(one.unit) if one.require else "", unit_text(one.unit))
          for one in profile.untold], _address_fields(profile.bus),
     )
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from profiles import Profile
-from tdhil.buses import FoundDrive, bus_named, required_text, unit_text
+from tdhil.buses import FoundDrive, bus_named
 from tdhil.config import Limits, Rig
 from tdhil.session.overrides import doubtful
 
@@ -224,7 +224,7 @@ def _untold(profile: Profile | None, known: Mapping[str, Any] = MappingProxyType
 
 def by_hand(profile: Profile) -> list[str]:
     """Return the settings that the operator makes at the drive, a line each. A run is refused until they are read."""
-    return [f"{_comment(one.title)}: {required_text(one.require, unit_text(one.unit))}" for one in profile.parameters
+    return [f"{_comment(one.title)}: {one.require.text_in(one.unit)}" for one in profile.parameters
             if one.require is not None]
 
 

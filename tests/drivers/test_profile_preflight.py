@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.canopen.quick_stop import CanopenTarget
-from drivers.cia402.limits import fulfils, wanted_text
+from drivers.cia402.limits import FLOAT_ROUNDING
 from drivers.drive import Mode, Outcome
 from profiles.canopen import CanopenProfile
 from profiles.entry import Require
@@ -175,8 +175,8 @@ def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
     (Require(equals=0.1), 0.10000000149011612, True),
 ])
 def test_requirements(require, value, good):
-    assert fulfils(require, value) is good
-    assert wanted_text(require, " s").endswith(" s")
+    assert require.met_by(value, FLOAT_ROUNDING * abs(value)) is good
+    assert require.text_in("s").endswith(" s")
 
 
 @pytest.mark.parametrize("limit_nm", [123.4567, 300.0005, 7.77])
