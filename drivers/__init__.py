@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from drivers.angle import Unwrapped as Unwrapped
     from drivers.clock import (
         Clock as Clock, LOWER_THE_RATE as LOWER_THE_RATE, MonotonicClock as MonotonicClock,
-        SteppedClock as SteppedClock, quantile as quantile,
+        SWITCH_S as SWITCH_S, SteppedClock as SteppedClock, quantile as quantile,
     )
     from drivers.drive import (
         Check as Check, Command as Command, Counters as Counters, Drive as Drive, DriveLimits as DriveLimits,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "angle": "Unwrapped",
-        "clock": "Clock LOWER_THE_RATE MonotonicClock SteppedClock quantile",
+        "clock": "Clock LOWER_THE_RATE MonotonicClock SWITCH_S SteppedClock quantile",
         "drive": "Check Command Counters Drive DriveLimits FrameTap Identity KeptAlive Mode Outcome Paced Polled "
                  "PositionReading Positioned PowerState Preflight RawFrame Rehearsed RemovesTorque ReportingFilters "
                  "ReportsOthers Sample StopsFeeding Timed",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 
+NO_ANGLE = "tdhil asks the operator to confirm the speed of the shaft"
+"""Consequence of a missing or unknown angle."""
+
 OVERSPEED = 2.0
 """Multiple of the speed limit. A shaft above this speed may turn by more than half a wrap undetected."""
 

@@ -86,6 +86,8 @@ class SteppedClock:
 LOWER_THE_RATE = "Lower --rate, or give --real-time-priority"
 """Advice if this computer, or its adapter, is too slow."""
 
+SWITCH_S = 0.0005
+"""Longest time for which another thread of this process may hold the interpreter, s, while a control loop runs."""
 RECENT = 1000
 """Number of cycles in the statistics of delays."""
 LATE_SHARE = 0.02

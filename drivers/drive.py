@@ -17,6 +17,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from drivers.clock import Clock
 
+LEAST_CYCLES = 5
+"""Least time of the drive's watchdog, cycles. It must not trip because of one or two lost frames or replies."""
+LOCAL_CYCLES = 3
+"""Number of cycles after which the loss of remote control counts. One damaged frame or reply does not matter."""
+REPEAT_MODE_CYCLES = 25
+"""Number of cycles after which a mode that is not displayed is requested again. One lost frame must not end a run."""
+
 
 class Mode(Enum):
     """Quantity that the drive controls."""

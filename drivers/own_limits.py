@@ -18,6 +18,16 @@ from drivers.preflight import PreflightTable
 WIDER_FLAG = "--accept-wider-limit"
 TORQUE, SPEED, QUICK_STOP = "torque", "speed", "quick-stop"
 NAMES = (TORQUE, SPEED, QUICK_STOP)
+LIMIT_SET_BY = {
+    "torque_limit": TORQUE, "torque_limit_reverse": TORQUE, "speed_limit": SPEED, "speed_limit_reverse": SPEED,
+    "quick_stop_time": QUICK_STOP, "quick_stop_deceleration": QUICK_STOP,
+}
+"""`set_to` of a profile's parameter → the limit that it sets."""
+TITLES = {
+    "torque_limit": "torque limit", "torque_limit_reverse": "torque limit, reverse", "speed_limit": "speed limit",
+    "speed_limit_reverse": "speed limit, reverse", "quick_stop_time": "quick-stop ramp",
+    "quick_stop_deceleration": "quick-stop ramp",
+}
 _SLACK = 1e-6
 """Relative difference from 32-bit rounding, or from half a count, that does not count as wider."""
 

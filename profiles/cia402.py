@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import DriveProfile, Positive, ProfileEntry, Require
-from profiles.model import DataModel, Finding, refuse_if
+from profiles.entry import DriveProfile, Name, ProfileEntry, Require
+from profiles.model import DataModel, Finding, Positive, refuse_if
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of a drive beyond CiA 402's own objects: read, required, written, or used as a scale.
@@ -22,7 +22,6 @@ from profiles.model import DataModel, Finding, refuse_if
 
 Index = Annotated[int, Field(ge=0x0001, le=0xFFFF)]
 SubIndex = Annotated[int, Field(ge=0, le=0xFF)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 ObjectType = Literal["u8", "u16", "u32", "i8", "i16", "i32", "f32"]
 SetTo = Literal["speed_limit", "speed_limit_reverse", "torque_limit", "torque_limit_reverse", "quick_stop_time",
                 "quick_stop_deceleration"]

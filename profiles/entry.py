@@ -74,7 +74,7 @@ Confidence = Literal["verified", "likely", "unverified"]
 """verified: read in the manufacturer's document or file · likely: a consistent second-hand source · unverified:
 neither."""
 
-Positive = Annotated[float, Field(gt=0)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 ProfileName = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/[a-z0-9._-]+$")]
 
 

@@ -12,12 +12,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import Confidence, DriveProfile, Positive, ProfileEntry, Require
-from profiles.model import DataModel, Finding, refuse_if
+from profiles.entry import Confidence, DriveProfile, Name, ProfileEntry, Require
+from profiles.model import DataModel, Finding, Positive, refuse_if
 
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 Unit = Literal["rpm", "rpm_s", "nm", "rated", "s", "hz", "kw", "none"]
 """Units of a value. rated = share of the rated torque, whose value in N·m is in `ModbusProfile.rated_torque` or

@@ -40,6 +40,7 @@ def _scaled(value: float, times: float, over: float) -> float:
 
 SPEED: Final = Unit("speed", "rad/s")
 RPM: Final = Unit("speed", "rpm", _TURN, 60.0)
+RAD_S_PER_RPM: Final = RPM.si(1.0)
 ACCELERATION: Final = Unit("acceleration", "rad/s²")
 ANGLE: Final = Unit("angle", "rad")
 TORQUE: Final = Unit("torque", "N·m")
@@ -121,7 +122,7 @@ _SPELT: Final[tuple[tuple[Unit, str], ...]] = (
 _UNITS: Final = {word: unit for unit, words in _SPELT for word in words.split()}
 _CASE_COUNTS: Final = {"M": _MEGABIT, "mHz": _MILLIHERTZ, "MHz": None, "m": None, "Ms": None, "MS": None,
                        "mNm": MILLINEWTON_METRE, "MNm": None}
-_IGNORED: Final = re.compile(r"[\s·.*⋅_^⁻-]")
+SIGNS_IGNORED: Final = re.compile(r"[\s·.*⋅_^⁻-]")
 _NUMBER: Final = re.compile(
     r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)(?![0-9])\s*(\S.*)?", re.DOTALL
 )
@@ -189,7 +190,7 @@ def in_nm(torque_nm: float) -> str:
 
 def unit_of(text: str) -> Unit | None:
     """Return the unit that ``text`` spells: ``rpm``, ``1/min``, ``N.m``, ``kg m^2``; None if it is unknown."""
-    bare = _IGNORED.sub("", text.replace("¹", "1").replace("²", "2"))
+    bare = SIGNS_IGNORED.sub("", text.replace("¹", "1").replace("²", "2"))
     folded = bare.casefold().replace("\u03bc", "\u00b5")       # casefold makes a Greek mu of the micro sign
     return _CASE_COUNTS[bare] if bare in _CASE_COUNTS else _UNITS.get(folded)
 

@@ -9,14 +9,23 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from sim_bus.fault_script import STOP, Cast, FaultKind, Passing, Scripted, error_code, object_place, plain, share
+from sim_bus.fault_script import (
+    FAULT_SEED,
+    STOP,
+    Cast,
+    FaultKind,
+    Passing,
+    Scripted,
+    error_code,
+    object_place,
+    plain,
+    share,
+)
 from sim_bus.object_drive import ObjectDrive
 from sim_bus.reports import Lie, lying
 from sim_bus.sdo_server import Meddling
 
 _PROFILE_VELOCITY = 3
-_SEED = 0xFA17
-"""Part of the seed by which faults differ from the noise of the drive."""
 
 M = TypeVar("M")
 """Type of a fault on the bus."""
@@ -72,7 +81,7 @@ class FaultSchedule(Generic[F]):
 
     def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F], seed: int) -> None:
         self.cast: Cast[F] = Cast(script, make)
-        self.rng = np.random.default_rng((seed, _SEED))
+        self.rng = np.random.default_rng((seed, FAULT_SEED))
 
     def happen_to(self, drive: ObjectDrive) -> None:
         """Apply the faults to this drive from now on."""

@@ -17,6 +17,8 @@ from typing import Generic, TypeVar
 
 from profiles import STAGE_NUMBERS, MessageCode, TdhilError
 
+FAULT_SEED = 0xFA17
+"""Part of the seed by which faults differ from the noise of the drive."""
 STOP = max(STAGE_NUMBERS.values()) + 1
 """Number of the moment at which a stop is requested while the shaft turns. No host announces it."""
 

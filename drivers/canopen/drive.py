@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from drivers.canopen import watchdog as arming
 from drivers.canopen.bus import PEER_DEAD_S, CanLink
 from drivers.canopen.other_master import ForeignTraffic
-from drivers.canopen.pdo import PdoFeedback, Slow, shape_of
+from drivers.canopen.pdo import NO_WORD, PdoFeedback, Slow, shape_of
 from drivers.canopen.pdo_mapping import DISABLED, slow_syncs
 from drivers.canopen.sdo import SdoObjects
 from drivers.canopen.slow_feedback import ModeAndDemand, SlowFeedback
@@ -64,7 +64,6 @@ time."""
 DOUBLED_ANSWERS = 3
 """Number of doubled answers that shows two nodes with one node-ID. `Cia402Drive.connect` sends about ten requests."""
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
-_NO_WORD = b""
 
 
 class CanopenBus(Cia402Bus):
@@ -252,7 +251,7 @@ class CanopenBus(Cia402Bus):
         feedback.begin(now_s, sync=sync)
         if sync:
             self._slow.begin()
-            self._link.send(SYNC, _NO_WORD, self.ticks.check)     # the SYNC makes the setpoint act
+            self._link.send(SYNC, NO_WORD, self.ticks.check)     # the SYNC makes the setpoint act
         age_s = self._await_feedback(now_s)
         self._cycles += 1
         doubted = feedback.doubted()

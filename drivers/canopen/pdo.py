@@ -146,7 +146,7 @@ def shape_of(profile: CanopenProfile) -> FrameShape:
 # that an older one was lost. If the older one still comes in the next cycle, neither counts.
 
 
-_NO_WORD = b""
+NO_WORD = b""
 ANSWER_WITHIN_S = 0.5
 """Time after which an answer counts as lost, s. The host gives up a silent drive after half of this time."""
 LONGEST_LATE_S = 0.05
@@ -178,7 +178,7 @@ class PdoFeedback:
         self._usual_s = 0.0            # time from a SYNC to its answer
         self._extra = False            # a surplus answer has come since the last call of `doubted`
         self._ends_cycles = False      # a simulated peer reports the end of a cycle
-        self.data = _NO_WORD           # statusword, torque, speed; as `FrameShape.feedback` packs them
+        self.data = NO_WORD            # statusword, torque, speed; as `FrameShape.feedback` packs them
         self.over = False              # the peer reported the end of this cycle
         self.arrived = 0               # number of all TPDO1s
         self.second = 0                # number of surplus TPDO1s in cycles that the peer had not ended
@@ -202,7 +202,7 @@ class PdoFeedback:
         self._begun_s = now_s
         self._here = 0
         self._spoiled = False
-        self.data = _NO_WORD
+        self.data = NO_WORD
         self.over = False
 
     def doubted(self) -> bool:
@@ -230,7 +230,7 @@ class PdoFeedback:
         if self._doubtful:
             self._doubtful = False
             if self._here > 1:         # the answer given up has come, so the first was not this cycle's
-                self.data = _NO_WORD
+                self.data = NO_WORD
             return
         if self.data or not self._due:
             return

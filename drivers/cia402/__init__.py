@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from drivers.cia402.sdo_message import (
         download as download, is_answer as is_answer, upload as upload, uploaded as uploaded,
     )
-    from drivers.cia402.state_machine import FAULT_BIT as FAULT_BIT, State as State, decode as decode
+    from drivers.cia402.state_machine import (
+        FAULT_BIT as FAULT_BIT, QUICK_STOP as QUICK_STOP, State as State, decode as decode,
+    )
     from drivers.cia402.supervision import DriveWatch as DriveWatch, Group as Group
     from drivers.cia402.watchdog import arm as arm
 else:
@@ -53,7 +55,7 @@ else:
         "quick_stop": "Cia402Target",
         "sdo_client": "SdoClient",
         "sdo_message": "download is_answer upload uploaded",
-        "state_machine": "FAULT_BIT State decode",
+        "state_machine": "FAULT_BIT QUICK_STOP State decode",
         "supervision": "DriveWatch Group",
         "watchdog": "arm",
     })

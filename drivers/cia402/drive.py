@@ -44,9 +44,11 @@ from drivers.cia402.state_machine import (
     decode,
 )
 from drivers.cia402.supervision import Group, ReadBack
-from drivers.cia402.watchdog import LEAST_CYCLES
 from drivers.clock import RATES_HZ, STALL_CYCLES, STALL_S, Ticks, how_late
 from drivers.drive import (
+    LEAST_CYCLES,
+    LOCAL_CYCLES,
+    REPEAT_MODE_CYCLES,
     Command,
     Counters,
     DriveLimits,
@@ -64,8 +66,6 @@ from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS, MessageCode
 from profiles.cia402 import Cia402Profile
 
-LOCAL_CYCLES = 3
-"""Number of cycles after which a missing remote bit counts (statusword, bit 9). One damaged frame does not matter."""
 DRIVE_SILENT_S = 0.5
 """Time without the drive's sign of life after which it counts as lost, s."""
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
@@ -76,8 +76,6 @@ cycles within this time brings no feedback, the shaft cannot be guarded. A bus t
 the limit."""
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
-_REPEAT_MODE_CYCLES = 25
-"""Number of cycles after which a mode that is not displayed is requested again. One lost frame must not end a run."""
 
 
 @dataclass(slots=True)
@@ -431,7 +429,7 @@ class Cia402Drive:
             return self._judge(now_s, bus.receive(now_s, fed or self.clock.stepped))
         mode = self._mode
         mode.cycles += 1
-        again = code != reported.shown_code and mode.cycles >= _REPEAT_MODE_CYCLES
+        again = code != reported.shown_code and mode.cycles >= REPEAT_MODE_CYCLES
         changes = code != mode.code or again or mode.overwritten
         word = DISABLE_VOLTAGE if power.removes_torque else controlword_towards(reported.state, power.wish)
         if content.vl and word == ENABLE_OPERATION:    # in vl mode the setpoint acts only with bits 4 to 6 set
@@ -554,7 +552,7 @@ class Cia402Drive:
             power.was_remote, power.local = True, 0
         elif power.was_remote:
             power.local += 1
-            if power.local == LOCAL_CYCLES:
+            if power.local == LOCAL_CYCLES:     # statusword, bit 9
                 self._bus.watch.interference(
                     f"the bus no longer controls the drive: bit 9 (remote) of the statusword {status:04X}h is 0",
                     f"{self._bus.place}, 6041h",

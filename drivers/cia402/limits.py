@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable
 
 from drivers.cia402.objects import Objects, name
-from drivers.cia402.process_data import RPM, decode_value, encode_value
+from drivers.cia402.process_data import decode_value, encode_value
 from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
-from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
+from drivers.own_limits import LIMIT_SET_BY, QUICK_STOP, SPEED, TITLES, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
 from profiles import Require, with_unit
 from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile, Parameter
+from profiles.quantities import RAD_S_PER_RPM
 
 QUICK_STOP_OPTION = 0x605A
 
@@ -81,16 +82,6 @@ def check_parameters(table: PreflightTable, objects: Objects, profile: Cia402Pro
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_LIMIT = {
-    "torque_limit": TORQUE, "torque_limit_reverse": TORQUE, "speed_limit": SPEED, "speed_limit_reverse": SPEED,
-    "quick_stop_time": QUICK_STOP, "quick_stop_deceleration": QUICK_STOP,
-}
-_TITLES = {
-    "torque_limit": "torque limit", "torque_limit_reverse": "torque limit, reverse", "speed_limit": "speed limit",
-    "speed_limit_reverse": "speed limit, reverse", "quick_stop_time": "quick-stop ramp",
-    "quick_stop_deceleration": "quick-stop ramp",
-}
-
 
 def set_limits(
     table: PreflightTable, objects: Objects, profile: Cia402Profile, limits: DriveLimits, rated_nm: float,
@@ -106,7 +97,7 @@ def set_limits(
         table.note("torque limit", "the drive has no 6072h; only the guard and the setpoint of the host limit torque")
     speed_lsb = profile.speed.max_motor_speed_rpm_per_lsb
     if speed_lsb is not None:
-        lsb = speed_lsb * RPM
+        lsb = speed_lsb * RAD_S_PER_RPM
         _limit(table, objects, own, SPEED, "speed limit", 0x6080, limits.speed_rad_s, lsb, 32, "rad/s", math.ceil)
     elif "speed_limit" not in elsewhere:
         table.note("speed limit", "the drive has no 6080h; set its own speed limit at the drive")
@@ -120,7 +111,7 @@ def set_limits(
             _set(table, objects, settings, one, limits, rated_nm, own)
     ramp_lsb = profile.quick_stop.deceleration_rpm_s_per_lsb
     if ramp_lsb is not None:
-        ramp, lsb = limits.quick_stop_rad_s2, ramp_lsb * RPM
+        ramp, lsb = limits.quick_stop_rad_s2, ramp_lsb * RAD_S_PER_RPM
         _limit(table, objects, own, QUICK_STOP, "quick-stop ramp", 0x6085, ramp, lsb, 32, "rad/s²", math.ceil)
     _set_quick_stop_option(table, objects, profile.quick_stop.option_code)
 
@@ -163,7 +154,7 @@ def _set(
 ) -> None:
     """Write one parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
     where, mend = name(one.index, one.sub), one.advice or ""
-    limit, title = _LIMIT[one.set_to or ""], _TITLES[one.set_to or ""]
+    limit, title = LIMIT_SET_BY[one.set_to or ""], TITLES[one.set_to or ""]
     unit = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s"}.get(one.unit, "")
     wished = {
         "torque_limit": f"{limits.torque_nm:g} N·m", "torque_limit_reverse": f"{-limits.torque_nm:g} N·m",
@@ -180,11 +171,11 @@ def _set(
         def braking(value: float) -> float:
             """Convert the time of a ramp to its deceleration; a time of 0 means no ramp."""
             if one.from_speed is None:
-                return value * (RPM if limit is QUICK_STOP else 1.0)
-            return RPM * settings.value(one.from_speed) / value if value > 0.0 else math.inf
+                return value * (RAD_S_PER_RPM if limit is QUICK_STOP else 1.0)
+            return RAD_S_PER_RPM * settings.value(one.from_speed) / value if value > 0.0 else math.inf
 
         if own.stays(limit, braking(shown(wanted)), braking(shown(before))):
-            si = abs(shown(before)) * {"rpm": RPM, "rated": rated_nm}.get(one.unit, 1.0)
+            si = abs(shown(before)) * {"rpm": RAD_S_PER_RPM, "rated": rated_nm}.get(one.unit, 1.0)
             objects.stands[one.index, one.sub] = before
             own.keep(table, limit, title, wished, f"{shown(before):.6g}{unit}", si, where)
             return
@@ -208,10 +199,10 @@ def _count(settings: DriveSettings, one: Parameter, limits: DriveLimits, rated_n
     if one.set_to == "torque_limit_reverse":
         return -_rounded(one, limits.torque_nm * nm, per_lsb, math.floor)
     if one.set_to == "speed_limit":
-        return _rounded(one, limits.speed_rad_s / RPM, per_lsb, math.ceil)
+        return _rounded(one, limits.speed_rad_s / RAD_S_PER_RPM, per_lsb, math.ceil)
     if one.set_to == "speed_limit_reverse":
-        return -_rounded(one, limits.speed_rad_s / RPM, per_lsb, math.ceil)
-    ramp_rpm_s = limits.quick_stop_rad_s2 / RPM
+        return -_rounded(one, limits.speed_rad_s / RAD_S_PER_RPM, per_lsb, math.ceil)
+    ramp_rpm_s = limits.quick_stop_rad_s2 / RAD_S_PER_RPM
     if one.from_speed is None:
         return _rounded(one, ramp_rpm_s, per_lsb, math.ceil)
     return _rounded(one, settings.value(one.from_speed) / ramp_rpm_s, per_lsb, math.floor)
@@ -223,7 +214,7 @@ def _rounded(one: Parameter, value: float, per_lsb: float, rounding: Callable[[f
     counts = rounding(value / per_lsb * (1.0 + (1e-9 if rounding is math.floor else -1e-9)))
     if counts > 0xFFFF_FFFF:
         raise ObjectRefused(f"{value:g} is above the range of the object", where=name(one.index, one.sub))
-    if counts < 1 and _LIMIT[one.set_to or ""] == TORQUE:      # one count would be a wider limit than requested
+    if counts < 1 and LIMIT_SET_BY[one.set_to or ""] == TORQUE:      # one count would be a wider limit than requested
         raise ObjectRefused(f"{value:g} is less than one count, {per_lsb:g}", where=name(one.index, one.sub))
     counts = max(1, counts)
     return counts * per_lsb

@@ -9,24 +9,24 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from drivers.angle import Unwrapped
+from drivers.angle import NO_ANGLE, Unwrapped
 from drivers.cia402.objects import Objects, name
 from drivers.cia402.polling import answer_time_s
-from drivers.cia402.process_data import RPM, bits_of, decode_value
+from drivers.cia402.process_data import bits_of, decode_value
 from drivers.clock import Clock
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, ObjectRefused
 from drivers.preflight import PreflightTable
 from profiles.cia402 import Cia402Profile, Position
+from profiles.quantities import RAD_S_PER_RPM
 
-TURN_RAD = 60.0 * RPM
+TURN_RAD = 60.0 * RAD_S_PER_RPM
 FEWEST_COUNTS = 16
 """Least counts of 608Fh for one turn. A lower value is not an encoder, but an object that was never set."""
 _ENCODER, _GEAR, _FEED, _UNIT = 0x608F, 0x6091, 0x6092, 0x60A8
 _INCREMENTS = (0x0000_0000, 0x00B5_0000)
 """Values of 60A8h for which one count of 6064h is one increment (CiA 303-2: B5h)."""
 _TITLE, _SCALE = "angle of the motor", "the scale of the position"
-_ASKED = "tdhil asks the operator to confirm the speed of the shaft"
 
 
 class AngleObject(NamedTuple):
@@ -64,14 +64,14 @@ def find_angle(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
     """Return the profile's angle object, or the standard's if the counts of a turn are known; else add a note."""
     entry = profile.position
     if entry is None:
-        table.note(_TITLE, f"not reported by this drive; {_ASKED}", "profile, position")
+        table.note(_TITLE, f"not reported by this drive; {NO_ANGLE}", "profile, position")
         return None
     where = name(entry.index, entry.sub)
     try:
         decode_value(entry.type, objects.read_bytes(entry.index, entry.sub), where)
         counts = entry.counts_per_turn or _standard_counts(objects)
     except ObjectRefused as error:
-        table.note(_TITLE, f"not available: {error.what}; {_ASKED}", error.where or where)
+        table.note(_TITLE, f"not available: {error.what}; {NO_ANGLE}", error.where or where)
         return None
     table.note(_TITLE, f"{counts:.10g} counts per turn, compared with the speed in stage 2", where)
     return AngleObject(entry, TURN_RAD / counts, where)

@@ -17,7 +17,6 @@ from drivers.cia402.objects import Objects, name, place
 from drivers.cia402.polling import reported_torque
 from drivers.cia402.process_data import (
     MODE_NAMES,
-    RPM,
     TARGET_VELOCITY,
     VELOCITY_ACTUAL,
     VL_ACTUAL,
@@ -35,6 +34,7 @@ from drivers.standstill import standstill_limit_rad_s
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode
 from profiles.cia402 import Cia402Profile, ReportingFilter
+from profiles.quantities import RAD_S_PER_RPM
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Filters on the reported signals of a drive, read from the objects that its profile names.
@@ -115,7 +115,7 @@ def speed_unit(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
             "unit of speed", f"{wanted:08X}h", name(SI_UNIT_VELOCITY), same,
             f"Every speed would be scaled wrongly. Set 60A9h to {wanted:08X}h, as in profile {profile.name}",
         )
-    per_lsb = speed.rpm_per_lsb * RPM
+    per_lsb = speed.rpm_per_lsb * RAD_S_PER_RPM
     if not (speed.times or speed.over):
         return per_lsb
     settings = DriveSettings(objects, profile)
@@ -129,7 +129,7 @@ def speed_unit(table: PreflightTable, objects: Objects, profile: Cia402Profile) 
         for scale in speed.over:
             product /= _nonzero(settings.value(scale), scale)
         found = product
-        return f"{product / RPM:.6g} rpm for one count", True
+        return f"{product / RAD_S_PER_RPM:.6g} rpm for one count", True
 
     scales = [profile.parameter(scale) for scale in (*speed.times, *speed.over)]
     table.attempt(

@@ -27,9 +27,6 @@ from drivers.drive import Mode, PowerState, Sample
 from drivers.errors import CommandRejected, ObjectRefused
 from profiles.cia402 import Cia402Profile, ObjectType, Position
 
-RPM = 2.0 * math.pi / 60.0
-"""rad/s in one rev/min."""
-
 # Objects, each as (index, subindex, bits).
 CONTROLWORD = (0x6040, 0, 16)
 STATUSWORD = (0x6041, 0, 16)

@@ -14,12 +14,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.cia402.objects import Objects, name
-from drivers.cia402.sdo_message import ABORT, UPLOAD_SEGMENT, abort_text, download, upload, value_of
+from drivers.cia402.sdo_message import ABORT, TOGGLE, UPLOAD_SEGMENT, abort_text, download, upload, value_of
 from drivers.errors import CommunicationLost, ObjectRefused
 from profiles import MessageCode
 
 _FRAME, _SEGMENT = 8, 7
-_TOGGLE = 0x10
 LONGEST_OBJECT = 1024
 """Longest object that is read, bytes. The longest that tdhil needs is a text of CiA 301, which has some tens."""
 LONGEST_NUMBER = 8
@@ -98,7 +97,7 @@ class SdoClient(Objects):
             # After a freeze of this computer the time in between is not the drive's.
             spent_s += min(time.monotonic() - begun_s, self._answer_s * self._tries[1])
             part = segment[1 : 8 - (segment[0] >> 1 & 7)] if len(segment) == _FRAME else segment[1:]
-            data, toggle, last = data + part, toggle ^ _TOGGLE, bool(segment[0] & 1)
+            data, toggle, last = data + part, toggle ^ TOGGLE, bool(segment[0] & 1)
             if len(data) > longest:
                 raise self._ended(request, where, f"sends more than {longest} bytes")
             if not last and not part:
@@ -129,7 +128,7 @@ class SdoClient(Objects):
             now, rest = rest[:_SEGMENT], rest[_SEGMENT:]
             head = toggle | _SEGMENT - len(now) << 1 | (not rest)
             self._transfer(bytes((head,)) + now.ljust(_SEGMENT, b"\0"), where, what, segment=1)
-            toggle ^= _TOGGLE
+            toggle ^= TOGGLE
 
     def _transfer(self, request: bytes, where: str, what: str, *, segment: int = 0) -> bytes:
         answer = self.call(request, where, self._answer_s, self._tries[segment])

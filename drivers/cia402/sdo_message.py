@@ -9,7 +9,7 @@ follow the first eight bytes.
 """
 
 UPLOAD, UPLOAD_SEGMENT, ABORT = 0x40, 0x60, 0x80
-_TOGGLE = 0x10
+TOGGLE = 0x10
 _ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
 """Command specifier of the request → that of its response: segment and initiate, download and upload."""
 _INITIATE = (1, 2)
@@ -77,7 +77,7 @@ def is_answer(request: bytes, response: bytes) -> bool:
         return same_object or command not in _INITIATE
     if response[0] >> 5 != _ANSWERS.get(command):
         return False
-    return same_object if command in _INITIATE else not (request[0] ^ response[0]) & _TOGGLE
+    return same_object if command in _INITIATE else not (request[0] ^ response[0]) & TOGGLE
 
 
 def value_of(answer: bytes) -> bytes:

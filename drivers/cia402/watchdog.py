@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.cia402.objects import Objects, name
+from drivers.drive import LEAST_CYCLES
 from drivers.preflight import DIES, PreflightTable, settle
 from profiles.cia402 import HostWatchdog
-
-LEAST_CYCLES = 5
-"""The watchdog must not trip because of one or two lost frames."""
 
 
 def arm(

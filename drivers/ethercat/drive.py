@@ -38,7 +38,6 @@ ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
 """Longest wait for the frame of a cycle, and for the answer of a register, as shares of the period."""
 SYNC0_SHARE = 0.5
 """Distance of SYNC0 behind the frame, as a share of the period: as far from the frames as possible on both sides."""
-QUICK_STOP = 0x0002
 NO_SETPOINTS = cia402.CycleSetpoints(0, 0, 0, 0, 0, False)
 SETPOINTS, FEEDBACK = 2, 3
 """Identifiers of the process data in the log: the sync managers."""
@@ -296,13 +295,13 @@ class EthercatBus(cia402.Cia402Bus):
 
     def disable_setpoints(self) -> int:
         """Set the process data to quick stop and setpoints of zero, which they keep. No PDO is switched off."""
-        self._setpoints = self._setpoints.stopped(QUICK_STOP)
+        self._setpoints = self._setpoints.stopped(cia402.QUICK_STOP)
         return 0
 
     def reach(self) -> None:
         """Make the objects readable, and feed the watchdog without setpoints that drive the shaft."""
         if self._setpoints.enables:
-            self._setpoints = self._setpoints.stopped(QUICK_STOP)
+            self._setpoints = self._setpoints.stopped(cia402.QUICK_STOP)
         with suppress(CommunicationLost):
             if self._station.al_status().state == INIT:
                 self._station.ask_for(PRE_OP)

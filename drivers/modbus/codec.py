@@ -13,13 +13,11 @@ from typing import Literal
 
 from drivers.errors import CommandRejected
 from profiles.modbus import CyclicSignal, Echo, ModbusProfile, Parameter, Register
+from profiles.quantities import RAD_S_PER_RPM
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Value of one count, in SI at the motor shaft: parameters' values first, then the scale of every signal. Pure.
 
-
-RPM = 2.0 * math.pi / 60.0
-"""rad/s in one rev/min."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def settle(profile: ModbusProfile, counts: Mapping[str, int], given: Mapping[str
 
 def si_per_count(signal: CyclicSignal | Echo, values: Mapping[str, float], rated_nm: float) -> float:
     """Return rad/s or N·m for one count. Raises KeyError if a parameter that it needs is unknown."""
-    unit = {"rpm": RPM, "nm": 1.0, "rated": rated_nm}[signal.unit]
+    unit = {"rpm": RAD_S_PER_RPM, "nm": 1.0, "rated": rated_nm}[signal.unit]
     factor = values[signal.times] if signal.times is not None else 1.0
     return signal.per_lsb * factor * unit
 

@@ -18,6 +18,8 @@ from contextlib import suppress
 from drivers.angle import Unwrapped
 from drivers.clock import Ticks
 from drivers.drive import (
+    LOCAL_CYCLES,
+    REPEAT_MODE_CYCLES,
     Command,
     Counters,
     DriveLimits,
@@ -68,8 +70,6 @@ from drivers.preflight import PreflightTable
 from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Register, StatusState
 
-REPEAT_MODE_CYCLES = 25
-"""Number of cycles after which a mode that is not displayed is requested again. One lost write must not end a run."""
 READ_MODE_CYCLES = 20
 """Number of cycles between two readings of the mode display, if they need a transaction of their own."""
 RESET_PAUSE_S = 0.1
@@ -77,8 +77,6 @@ RESET_PAUSE_S = 0.1
 BUDGET_SHARE = 0.5
 """Share of the watchdog time for which a valid reply may be missing, or this loop may be delayed."""
 
-LOCAL_CYCLES = 3
-"""Number of cycles after which the loss of remote control counts. One damaged reply does not matter."""
 SETTLED_CYCLES = 5
 """Number of cycles without an enabled drive. If the drive is enabled after them, another master enabled it."""
 INSIST_SHARE = 0.8

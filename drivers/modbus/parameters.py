@@ -14,12 +14,13 @@ from typing import NamedTuple
 from drivers.drive import DriveLimits, ReportingFilters, SpeedLoopPresent
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus.access import RegisterAccess
-from drivers.modbus.codec import RANGES, RPM, per_count, register_name, settle, to_counts
-from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
+from drivers.modbus.codec import RANGES, per_count, register_name, settle, to_counts
+from drivers.own_limits import LIMIT_SET_BY, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable, agreed_rated_torque, spare
 from drivers.speed_loop import ReadSetting, read_speed_loop
 from profiles import unit_text
 from profiles.modbus import ModbusProfile, Parameter, Register
+from profiles.quantities import RAD_S_PER_RPM
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def check_name_plate(table: PreflightTable, profile: ModbusProfile, found: Param
         return              # refused already, where it was read
     power_w = power * {"kw": 1e3}.get(profile.parameter(plate.power).unit, 1.0)
     torque_nm = torque * (rated_nm if profile.parameter(plate.torque).unit == "rated" else 1.0)
-    product_w = torque_nm * speed * RPM
+    product_w = torque_nm * speed * RAD_S_PER_RPM
     good = power_w > 0.0 and torque_nm > 0.0 and abs(product_w - power_w) <= plate.tolerance * power_w
     table.row(
         "name plate: torque × speed",
@@ -227,11 +228,6 @@ class RegisterSetting(NamedTuple):
     per_count: float
 
 
-_LIMIT = {
-    "torque_limit": TORQUE, "torque_limit_reverse": TORQUE, "speed_limit": SPEED, "speed_limit_reverse": SPEED,
-    "quick_stop_time": QUICK_STOP, "quick_stop_deceleration": QUICK_STOP,
-}
-
 
 def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits,
                rated_nm: float,
@@ -244,7 +240,7 @@ def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusPro
         if parameter.set_to is None or parameter.set_to == "watchdog":
             continue
         kinds.add(parameter.set_to)
-        if parameter.set_to in _LIMIT:
+        if parameter.set_to in LIMIT_SET_BY:
             _write_limit(table, access, parameter, limits, rated_nm, found.values, own)
         else:
             write_setting(table, access, parameter, limits, rated_nm, found.values)
@@ -262,7 +258,7 @@ def _write_limit(
     own: OwnLimits,
 ) -> None:
     """Write one of the drive's own limits, unless the drive's is tighter and may not be widened."""
-    register, where, limit = parameter.register_, where_of(parameter), _LIMIT[parameter.set_to or ""]
+    register, where, limit = parameter.register_, where_of(parameter), LIMIT_SET_BY[parameter.set_to or ""]
     assert register is not None
     try:
         setting = wanted_setting(parameter, limits, rated_nm, values)
@@ -276,14 +272,15 @@ def _write_limit(
         value = counts * setting.per_count
         if parameter.set_to != "quick_stop_time":
             return value
-        from_rpm = values.get(parameter.times or "", limits.speed_rad_s / RPM)
+        from_rpm = values.get(parameter.times or "", limits.speed_rad_s / RAD_S_PER_RPM)
         return abs(from_rpm) / value if value > 0.0 else math.inf
 
     def shown(counts: int) -> str:
         return show(counts * setting.per_count, parameter)
 
     if own.stays(limit, bound(setting.counts), bound(before)):
-        si = bound(before) * {"rpm": RPM, "rpm_s": RPM, "rated": rated_nm, "s": RPM}.get(parameter.unit, 1.0)
+        in_si = dict.fromkeys(("rpm", "rpm_s", "s"), RAD_S_PER_RPM) | {"rated": rated_nm}
+        si = bound(before) * in_si.get(parameter.unit, 1.0)
         own.keep(table, limit, parameter.title, shown(setting.counts), shown(before), si, where)
         return
     if not parameter.writable_in_operation:
@@ -310,7 +307,7 @@ def own_speed_limits(profile: ModbusProfile, found: Parameters) -> list[tuple[Re
         lsb = per_count(parameter, found.values)
         settable = parameter.set_to in ("speed_limit", "speed_limit_reverse") and parameter.writable_in_operation
         if settable and register is not None and before is not None and lsb and parameter.unit == "rpm":
-            limits.append((register, lsb * RPM, before))
+            limits.append((register, lsb * RAD_S_PER_RPM, before))
     return limits
 
 
@@ -353,24 +350,24 @@ def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float,
     sign = -1.0 if kind in ("speed_limit_reverse", "torque_limit_reverse") and not signless else 1.0
     rounding: Callable[[float], int] = math.ceil
     if kind in ("speed_limit", "speed_limit_reverse"):
-        value = limits.speed_rad_s / _unit(parameter, {"rpm": RPM})
+        value = limits.speed_rad_s / _unit(parameter, {"rpm": RAD_S_PER_RPM})
     elif kind in ("torque_limit", "torque_limit_reverse"):
         value = limits.torque_nm / _unit(parameter, {"nm": 1.0, "rated": rated_nm})
         rounding = math.floor
     elif kind == "quick_stop_deceleration":
-        value = limits.quick_stop_rad_s2 / _unit(parameter, {"rpm_s": RPM})
+        value = limits.quick_stop_rad_s2 / _unit(parameter, {"rpm_s": RAD_S_PER_RPM})
     elif kind in ("quick_stop_time", "ramp_up_time"):
-        from_rpm = values.get(parameter.times) if parameter.times is not None else limits.speed_rad_s / RPM
+        from_rpm = values.get(parameter.times) if parameter.times is not None else limits.speed_rad_s / RAD_S_PER_RPM
         if from_rpm is None:
             raise CommandRejected(f"the speed '{parameter.times}' that it counts from is unknown", where=where)
-        value = abs(from_rpm) * RPM / limits.quick_stop_rad_s2 / _unit(parameter, {"s": 1.0})
+        value = abs(from_rpm) * RAD_S_PER_RPM / limits.quick_stop_rad_s2 / _unit(parameter, {"s": 1.0})
         rounding = math.floor if kind == "quick_stop_time" else math.ceil
     else:
         value = limits.watchdog_s / _unit(parameter, {"s": 1.0})
         rounding = math.floor
     slack = _SLACK if rounding is math.floor else -_SLACK
     counts = to_counts(value * (1.0 + slack), lsb, register, where, rounding)
-    if counts < 1 and _LIMIT.get(kind or "") == TORQUE:        # one count would be a wider limit than requested
+    if counts < 1 and LIMIT_SET_BY.get(kind or "") == TORQUE:        # one count would be a wider limit than requested
         raise CommandRejected(
             f"{show(value, parameter)} is less than one count, {show(lsb, parameter)}", where=where,
             next_step="The drive cannot represent so low a limit. Check its scale, and the limit in rig.yaml",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from drivers.angle import NO_ANGLE
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
@@ -15,7 +16,6 @@ from drivers.preflight import PreflightTable
 from profiles.modbus import ModbusProfile, Position
 
 _TITLE = "angle of the motor"
-_ASKED = "tdhil asks the operator to confirm the speed of the shaft"
 _WIDTHS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
 
 
@@ -53,13 +53,13 @@ def find_angle(table: PreflightTable, access: RegisterAccess, profile: ModbusPro
     """Return the profile's angle register if the drive gives it; add a note in any case."""
     entry = profile.position
     if entry is None:
-        table.note(_TITLE, f"not reported by this drive; {_ASKED}", "profile, position")
+        table.note(_TITLE, f"not reported by this drive; {NO_ANGLE}", "profile, position")
         return None
     where = register_name(entry.register_)
     try:
         access.read(entry.register_)
     except PreflightRefused as error:
-        table.note(_TITLE, f"not reported: {error.what}; {_ASKED}", where)
+        table.note(_TITLE, f"not reported: {error.what}; {NO_ANGLE}", where)
         return None
     table.note(_TITLE, f"{entry.counts_per_turn:.10g} counts per turn, compared with the speed in stage 2", where)
     return AngleRegister(entry, profile.line.word_order)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.drive import DriveLimits
+from drivers.drive import LEAST_CYCLES, DriveLimits
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import RegisterAccess
@@ -15,8 +15,6 @@ from drivers.modbus.parameters import Parameters, show, where_of, write_setting
 from drivers.preflight import ANY_CLIENT, DIES, SHARED_FLAG, PreflightTable, settle
 from profiles.modbus import ModbusProfile, Parameter
 
-LEAST_CYCLES = 5
-"""The watchdog must not trip because of one or two lost replies."""
 MEASURED_ROUNDS = 20
 CARRIES, MARGIN = 1.02, 1.1
 """Factors for the period. The line carries a period that is longer than its slowest usual round by the first factor. If

@@ -26,6 +26,8 @@ class DriveReply(NamedTuple):
 
 
 NONE = DriveReply(None)
+BROADCAST = 0
+"""Unit address of a request to all units, which none answers."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 
 from profiles.modbus import BusLine, ModbusProfile
 from sim_bus.fault_script import Scripted
+from sim_bus.modbus.codec import BROADCAST
 from sim_bus.modbus.faults import Faults, tells_stage, wrongs_of
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong
@@ -85,7 +86,6 @@ class LineTiming:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_BROADCAST = 0
 AT_REST_RAD_S = 0.01
 RESTING_S, LONGEST_S = 1.2, 60.0
 """Duration of standstill after which a shaft without a host is no longer simulated, and longest simulated time, s."""
@@ -150,12 +150,12 @@ class EmbeddedModbusDrive:
         timing = self.timing
         acts_s = max(now_s, self._free_s) + timing.acts_after_s(len(pdu), self._chances.random())
         self.run_until(acts_s)
-        if unit not in {self.unit, _BROADCAST}:
+        if unit not in {self.unit, BROADCAST}:
             self._free_s = acts_s
             return None, acts_s
         reply = self._faults.request(pdu, connection)
         heard = None if reply.crc_bits else reply.pdu      # a host's receiver drops a frame with a wrong CRC
-        if unit == _BROADCAST or heard is None:
+        if unit == BROADCAST or heard is None:
             self._free_s = acts_s
             return None, acts_s
         complete_s = acts_s + timing.way_s(len(heard), self._chances.random())

@@ -18,6 +18,7 @@ from profiles import MARKER_STAGE_REGISTER
 from profiles.modbus import ModbusProfile
 from sim_bus.cia402 import OperationMode
 from sim_bus.fault_script import (
+    FAULT_SEED,
     STOP,
     Cast,
     FaultKind,
@@ -399,7 +400,6 @@ def listed(line_kind: str) -> tuple[KnownFault, ...]:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_SEED = 0xFA17
 _WRITES = (6, 16)
 _STAGE_REGISTER = MARKER_STAGE_REGISTER.to_bytes(2, "big")
 
@@ -416,7 +416,7 @@ class Faults:
                  seed: int = 0) -> None:
         self._machine = machine
         self._cast: Cast[Misbehaviour] = Cast(script, make)
-        scene = Scene(machine, profile, np.random.default_rng((seed, _SEED)))
+        scene = Scene(machine, profile, np.random.default_rng((seed, FAULT_SEED)))
         for fault in self._cast.all:
             fault.scene = scene
         if script:

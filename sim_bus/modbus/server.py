@@ -4,13 +4,12 @@ import select
 import threading
 import time
 
-from sim_bus.modbus.codec import NONE, DriveReply
+from sim_bus.modbus.codec import BROADCAST, NONE, DriveReply
 from sim_bus.modbus.faults import Faults
 from sim_bus.modbus.lines import ReceivedRequest, RequestListener
 from sim_bus.modbus.machine import Machine
 
 _POLL_S = 0.005
-_BROADCAST = 0
 _ANY_UNIT = 255
 """Unit of a TCP host without a gateway (messaging guide, section 4.4.1.2)."""
 
@@ -26,7 +25,7 @@ class DriveServer:
         self._ask = (
             (lambda pdu, connection: DriveReply(machine.request(pdu, connection))) if faults is None else faults.request
         )
-        self._whole = (unit, _BROADCAST, _ANY_UNIT) if gateway else (unit,)
+        self._whole = (unit, BROADCAST, _ANY_UNIT) if gateway else (unit,)
         self._began_s = time.monotonic()
 
     def run(self, stop: threading.Event) -> None:
@@ -44,7 +43,7 @@ class DriveServer:
         self._catch_up()
         if request.unit in self._whole:
             return self._ask(request.pdu, request.connection)
-        if request.unit == _BROADCAST:
+        if request.unit == BROADCAST:
             self._ask(request.pdu, request.connection)
         return NONE
 

@@ -23,11 +23,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.estimation import ResidualTest, Verdict
-from tdhil.estimation.frequency_domain import student_quantile
+from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
 from tdhil.recording import FloatArray
 
-CERTAIN = 1e6
-"""Degrees of freedom that count as infinite: those of an input whose stated uncertainty is taken as exact."""
 CONTRADICTED_P = 0.001
 """p-value below which a test contradicts shared filters or a straight line."""
 LARGEST_ERROR, LARGEST_IN_SD = 0.15, 5.0

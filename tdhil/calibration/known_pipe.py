@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 
 from tdhil.calibration.added_body import (
-    CERTAIN,
     LARGEST_ERROR,
     FactorLine,
     MeasuredValue,
@@ -25,6 +24,7 @@ from tdhil.calibration.added_body import (
     measured_value,
 )
 from tdhil.estimation import MeasuredString, normal_quantile
+from tdhil.estimation.frequency_domain import CERTAIN
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.calibration.added_body import (
-    CERTAIN,
     CONTRADICTED_P,
     LARGEST_ERROR,
     FactorLine,
@@ -29,6 +28,7 @@ from tdhil.calibration.added_body import (
     measured_value,
 )
 from tdhil.estimation import ResidualTest
+from tdhil.estimation.frequency_domain import CERTAIN
 from tdhil.recording import FloatArray
 
 LEAST_PAIRS = 3

@@ -29,7 +29,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.calibration.added_body import (
-    CERTAIN,
     LARGEST_ERROR,
     FactorLine,
     MeasuredValue,
@@ -37,6 +36,7 @@ from tdhil.calibration.added_body import (
     measured_value,
 )
 from tdhil.estimation import normal_quantile
+from tdhil.estimation.frequency_domain import CERTAIN
 from tdhil.recording import FloatArray
 
 LEAST_OVERLAP_S = 20.0

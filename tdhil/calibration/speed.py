@@ -13,9 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tdhil.calibration.added_body import CERTAIN, LARGEST_ERROR, MeasuredValue, measured_value
-from tdhil.estimation import AngleRatio, Verdict
-from tdhil.estimation.frequency_domain import student_quantile
+from tdhil.calibration.added_body import LARGEST_ERROR, MeasuredValue, measured_value
+from tdhil.estimation import RATIOS_ALIKE, AngleRatio, Verdict
+from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def calibrate_by_position(
                         scatter / abs(value) if value else math.inf),
     ) if line.standard_uncertainty > 0.0)
     for one in stretches:
-        if abs(one.value - value) > one.half_width + bound + _ALIKE * abs(value):
+        if abs(one.value - value) > one.half_width + bound + RATIOS_ALIKE * abs(value):
             return SpeedCalibration(
                 Verdict.MODEL_REJECTED, f"the scale of the reported speed changed during the run: the factor is"
                 f" {one.value:.4g} in {one.where} and {value:.4g} in the mean", "check the encoder, its coupling and"
@@ -125,8 +125,6 @@ def calibrate_by_position(
     return _concluded("position", value, budget, wanted, confidence, None)
 
 
-_ALIKE = 0.02
-"""Largest difference of two ratios, as for two stages in `tdhil.estimation`, because both are rounded."""
 
 
 def _concluded(

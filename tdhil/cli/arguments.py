@@ -38,6 +38,12 @@ def amount(unit: Unit) -> Callable[[str], float]:
 share = amount(SHARE)
 """Reader of a share, ``1%`` or ``0.01``."""
 
+LARGEST_VALUE: Final = 1e9
+"""Largest value of a quantity of a calibration, in its unit of SI. A larger one is a typing error."""
+
+PICTURES: Final = (".png", ".svg", ".pdf")
+"""Endings of a picture's file."""
+
 
 _LEAST_ALIKE = 0.78
 """Least similarity (`difflib`, 0 to 1) of a suggested name. A mistyped name has 0.9 and more; another word that only

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from profiles.quantities import INERTIA
-from tdhil.cli.arguments import add_option, amount, share
+from tdhil.cli.arguments import LARGEST_VALUE, add_option, amount, share
 from tdhil.cli.calibrate_reference import WITHOUT_BODY, require_new, run_without_body
 from tdhil.cli.calibrate_speed import add_speed_arguments
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from tdhil.session import CalibrationRun
 
 _EXAMPLE = "tdhil calibrate torque without.mcap with.mcap --added 55"
-_LARGEST = 1e9
-"""Largest inertia of a body, kg·m²."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -164,7 +162,7 @@ def _wanted(namespace: argparse.Namespace) -> Wanted:
 
 
 def _positive(flag: str, value: float | None, *, zero: bool = False) -> None:
-    if value is not None and not ((value > 0.0 or (zero and value == 0.0)) and value <= _LARGEST):
+    if value is not None and not ((value > 0.0 or (zero and value == 0.0)) and value <= LARGEST_VALUE):
         raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
 
 

@@ -9,12 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from profiles.quantities import INERTIA
-from tdhil.cli.arguments import amount, hide_rare
+from tdhil.cli.arguments import LARGEST_VALUE, amount, hide_rare
 from tdhil.config import OPTION, load_rig, resolve
 from tdhil.errors import ExitCode, UsageError, existing_file
 
 _EXAMPLE = "tdhil identify --calibrate --added 55"
-_LARGEST = 1e9
 Run = Callable[[argparse.Namespace, list[Path]], int]
 """One run with its own confirmation: it appends the path of its log, and returns the exit code."""
 
@@ -35,7 +34,8 @@ def check_calibrate(namespace: argparse.Namespace) -> None:
     for flag, value in (("--added", namespace.added), ("--added-sd", namespace.added_sd)):
         if value is not None and not namespace.calibrate:
             raise UsageError("is for a calibration", where=flag, next_step=f"Such as: {_EXAMPLE}")
-        if value is not None and not ((value > 0.0 or (flag == "--added-sd" and value == 0.0)) and value <= _LARGEST):
+        zero = flag == "--added-sd" and value == 0.0
+        if value is not None and not ((value > 0.0 or zero) and value <= LARGEST_VALUE):
             raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
     if not namespace.calibrate:
         return

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from profiles.quantities import SPEED, TIME
-from tdhil.cli.arguments import add_option, amount, share
+from tdhil.cli.arguments import LARGEST_VALUE, add_option, amount, share
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from tdhil.session import RunRecord
 
 _EXAMPLE = "tdhil calibrate speed --turns 100 --seconds 312.4 --speed 2.0"
-_LARGEST = 1e9
 _OF_TURNS = ("seconds", "speed", "from", "to", "turns_sd", "seconds_sd", "speed_sd")
 _OF_LOG = ("from", "to")
 _OF_DISPLAY = ("speed", "speed_sd")
@@ -122,7 +121,7 @@ def _check(namespace: argparse.Namespace) -> None:
     for name, value in given.items():
         zero, signed = name.endswith("_sd") or name in _OF_LOG, name in ("speed", "from", "to")
         size = abs(value) if signed else value
-        if not (0.0 < size <= _LARGEST or (zero and size == 0.0)):
+        if not (0.0 < size <= LARGEST_VALUE or (zero and size == 0.0)):
             raise UsageError(f"{value:g}: must be a positive number", where=_flag(name))
     if namespace.turns is None:
         if given:

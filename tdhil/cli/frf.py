@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from profiles import with_code
-from tdhil.cli.arguments import add_option, add_settings, require_target, settings_in
+from tdhil.cli.arguments import PICTURES, add_option, add_settings, require_target, settings_in
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from tdhil.api import Result
 
 _TABLES: Final = (".csv", ".parquet")
-_PICTURES: Final = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +93,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
     """Check both files before a log is read. Raises UsageError."""
-    for flag, path, endings in (("--out", namespace.out, _TABLES), ("--plot", namespace.plot, _PICTURES)):
+    for flag, path, endings in (("--out", namespace.out, _TABLES), ("--plot", namespace.plot, PICTURES)):
         if path is None:
             continue
         if path.suffix.lower() not in endings:

@@ -6,7 +6,6 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import Final
 
 from profiles import visible
 
@@ -50,8 +49,8 @@ def _asked() -> str | None:
     if sys.stdin is None or not sys.stdin.isatty():
         return None
     print("Name of this rig, such as bench 3: ", end="", file=sys.stderr, flush=True)  # noqa: T201
-    return visible(sys.stdin.readline().strip())[:_LONGEST_NAME] or None
+    from tdhil.config import LONGEST_NAME
+
+    return visible(sys.stdin.readline().strip())[:LONGEST_NAME] or None
 
 
-_LONGEST_NAME: Final = 200
-"""Longest name of a rig, characters, as in the schema of rig.yaml."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
-from tdhil.cli.arguments import add_option, amount, require_target
+from tdhil.cli.arguments import PICTURES, add_option, amount, require_target
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
@@ -46,7 +46,6 @@ ASSUMED_DEAD_TIME_S = 0.003
 """Assumed dead time, s: one and a half control periods of 2 ms."""
 STATED_TOLERANCE, ASSUMED_TOLERANCE = 0.1, 0.5
 """Relative half-width of each lag's interval, for a stated and for an assumed lag."""
-_PICTURES = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -140,8 +139,8 @@ def _check(namespace: argparse.Namespace) -> None:
                          next_step="Leave out --present, --inner-lags and --dead-time, or --impedance",
                          entry=MessageCode.VALUE_NOT_ALLOWED)
     check_inner_lags(namespace)
-    if namespace.plot is not None and namespace.plot.suffix.lower() not in _PICTURES:
-        raise UsageError(f"ends in none of {', '.join(_PICTURES)}", where=f"--plot {namespace.plot}",
+    if namespace.plot is not None and namespace.plot.suffix.lower() not in PICTURES:
+        raise UsageError(f"ends in none of {', '.join(PICTURES)}", where=f"--plot {namespace.plot}",
                          next_step="Such as --plot tune.png", entry=MessageCode.VALUE_NOT_ALLOWED)
     require_result(namespace.result)
     if namespace.impedance is not None:

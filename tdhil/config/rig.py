@@ -81,6 +81,8 @@ Time = Annotated[float, _within(1e-6, 1e7)]
 Inertia = Annotated[float, _within(1e-9, 1e9)]
 Ratio = Annotated[float, _within(1e-6, 1e6)]
 
+LONGEST_NAME = 200
+"""Longest name of a rig, characters."""
 LONGEST_BRAKING_S = 90.0
 """Longest braking from the highest speed, s. The program waits for a stop for three times its ramp, at most 5 min."""
 
@@ -274,7 +276,7 @@ class Rig(_Options):
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     name: str | None = Field(
-        default=None, min_length=1, max_length=200,
+        default=None, min_length=1, max_length=LONGEST_NAME,
         description="name of the rig in reports and histories; required unless the drive is simulated",
     )
     limits: Limits | None = Field(default=None, description="required unless the drive is simulated")

@@ -1,7 +1,7 @@
 """Identification of the inertia from a recording. Pure numpy and scipy; needs no drive and no file."""
 
 from tdhil.estimation.cross_checks import (
-    AngleRatio as AngleRatio, angle_ratios as angle_ratios, mean_speed as mean_speed,
+    RATIOS_ALIKE as RATIOS_ALIKE, AngleRatio as AngleRatio, angle_ratios as angle_ratios, mean_speed as mean_speed,
     torque_contradiction as torque_contradiction, torque_ratios as torque_ratios,
 )
 from tdhil.estimation.data_checks import (

@@ -34,9 +34,9 @@ import numpy as np
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.cubic_spline import CubicSpline
 from tdhil.estimation.frequency_domain import ModelCurve, filters
-from tdhil.estimation.line_influence import inertia_changes, segment_means, widened
+from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segment_means, widened
 from tdhil.estimation.result import AngleHarmonic, Estimate, normal_quantile
-from tdhil.estimation.samples import Samples, Stretch, angle_readings, usual_interval
+from tdhil.estimation.samples import LONGEST_GAP, Samples, Stretch, angle_readings, usual_interval
 from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Recording
 
@@ -57,11 +57,9 @@ _USED_BAND = 0.3          # of the rate: highest frequency used
 _ANGLE_BAND = 0.25        # of the rate of the angle's readings: highest frequency of its derivative
 _LOUDER = 4.0             # largest power of the rest by the angle over that by the speed, with which it is used
 _TAPER = 0.25             # of a period: length of the taper at either end of a segment
-_LEAST_PERIODS = 3        # periods in one segment
 _BAND_BINS = 24           # fewest spectral lines whose median gives the noise
 _BAND_RATIO = 1.15        # ratio of the frequencies at the ends of such a band, where it has more lines
 _MEDIAN = math.log(2.0)   # median of |x|² over its mean, complex Gaussian
-_LONGEST_GAP = 0.1        # cycles of the fastest excited line: longest gap between two angles
 _ROUNDS = 2               # rounds of harmonics and model
 _STEP = 0.5               # sd: step of a parameter, for the slope of the harmonics over it
 _FINER = 2                # grid points for one sample, on which the harmonics pass the filter
@@ -194,7 +192,7 @@ def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _GridSegment 
     begin = stretch.segment.start_s + first * period_s
     end = begin + periods * period_s
     inside = samples.between(begin - 1e-9, end - 1e-9)
-    if periods < _LEAST_PERIODS or not angle.covers(begin, end, _LONGEST_GAP / max(stretch.segment.lines_hz)):
+    if periods < LEAST_PERIODS or not angle.covers(begin, end, LONGEST_GAP / max(stretch.segment.lines_hz)):
         return None
     interval = max(usual_interval(inside.time_s), 1.0 / _MOST_RATE_HZ)
     count = max(1, round(period_s / interval))

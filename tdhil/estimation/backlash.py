@@ -40,7 +40,7 @@ from profiles import CodedText, MessageCode
 from profiles.quantities import printed_interval
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import ModelCurve, filters
-from tdhil.estimation.line_influence import inertia_changes, segment_means, widened
+from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segment_means, widened
 from tdhil.estimation.result import Backlash, Estimate, Refusal, normal_quantile
 from tdhil.estimation.samples import Samples, Stretch, angle_readings, thinned
 from tdhil.estimation.spectrum import ComplexArray
@@ -54,7 +54,6 @@ _SMALLEST_SHARE = 0.05    # least explained share that counts
 _LEAST_EXPLAINED = 0.6    # share of the angle beyond noise; below it the size of the play is open
 _FIRST_GAIN = 12.0        # least gain on the coarse grid, for a fit
 _MODEL_REL = 0.2          # relative half-width for flanks that yield or rebound; `benchmarks/backlash.py`
-_LEAST_PERIODS = 3        # periods in one segment
 _BEYOND = 12              # times the highest excited harmonic: highest harmonic used
 _MOST_HARMONICS = 80      # highest harmonic used, unless an excited one is above a half of it
 _LEAST_BEYOND = 2         # times the highest excited harmonic: fewest harmonics used
@@ -322,7 +321,7 @@ def _angle_of(
 ) -> _SegmentAngle | None:
     """Return the angle of a segment; None for too few periods or too few readings."""
     segment, (time, turned) = stretch.segment, readings
-    if len(stretch.periods) < _LEAST_PERIODS:
+    if len(stretch.periods) < LEAST_PERIODS:
         return None
     begins = [segment.start_s + number * segment.period_s for number in stretch.index]
     spans = [np.searchsorted(time, (begin - 1e-9, begin + segment.period_s - 1e-9)) for begin in begins]

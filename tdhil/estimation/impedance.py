@@ -57,10 +57,10 @@ from numpy.typing import NDArray
 
 from profiles.quantities import printed_interval
 from tdhil.estimation.case import PeriodicCase
-from tdhil.estimation.frequency_domain import Box, descend, student_quantile
+from tdhil.estimation.frequency_domain import AT_BOUND, CERTAIN, Box, descend, student_quantile
 from tdhil.estimation.result import DriveImpedance, Estimate, ImpedancePoint, ResidualTest, Verdict, rejects
 from tdhil.estimation.samples import Stretch, usual_interval
-from tdhil.estimation.spectrum import ComplexArray
+from tdhil.estimation.spectrum import BLOCK, FLOOR, ComplexArray
 from tdhil.recording import BoolArray, FloatArray, ImpedanceInput
 
 OFFSET: Final = "offset"
@@ -81,13 +81,9 @@ _MOST_PROFILE_FITS = 12        # fits for one end of a profile interval, at most
 _SIGNALS = 2                   # speed and torque
 _LEAST_PERIODS = 5             # fewest periods in a row: an excited line then has at least four lines beside it
 _BESIDE = 5                    # most noise lines used on either side of an excited line
-_BLOCK = 8192                  # samples worked on at once
-_FLOOR = 1e-14                 # relative variance below which noise is rounding of the arithmetic
 _LEAST_LINES = 4          # fewest lines for the fit
 _CLEAR = 9.0                   # |mean|² over its variance, from which a line is clear
 _STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))   # s; start values of the lags of speed and torque
-_OPEN = 0.5                    # relative half-width of P beyond which no value is given
-_AT_BOUND = 1e-6          # of a parameter's scale: a parameter nearer to its bound is at the bound
 _REFERENCE_GAIN = 10.83        # gain of −2 ln L from which a reference filter is real: probability 0.001 by chance
 _SMALL_FILTER_LOSS = 3.84      # rise of −2 ln L by which the data contradict a filter: probability 0.05 by chance
 _SMALL_FILTERS_S = tuple(0.01 * k for k in range(1, 16))
@@ -191,8 +187,8 @@ def _spectrum(
     normal, right = np.zeros((size, size)), np.zeros((size, 2))
     middle = 0.5 * (time[0] + time[-1])
     span = time[-1] - time[0]
-    for first in range(0, len(time), _BLOCK):
-        block = slice(first, first + _BLOCK)
+    for first in range(0, len(time), BLOCK):
+        block = slice(first, first + BLOCK)
         angle = np.multiply.outer(time[block] - segment.start_s, omega)
         design = np.column_stack([
             np.ones(len(angle)), 2.0 * (time[block] - middle) / span, np.cos(angle), np.sin(angle)
@@ -204,7 +200,7 @@ def _spectrum(
     at = {turn: number for number, turn in enumerate(every)}
     excited: ComplexArray = table[[at[turn] for turn in turns]]
     noise = tuple(table[[at[turn] for turn in some]] for some in beside)
-    floor = _FLOOR * np.max(np.abs(excited) ** 2, axis=0)
+    floor = FLOOR * np.max(np.abs(excited) ** 2, axis=0)
     return excited, noise, np.asarray(rounding) + floor
 
 
@@ -438,7 +434,7 @@ def _descended(
     found = descend(
         lambda theta: (problem.residuals(theta), lambda: problem.slopes(theta, scale)), start, free, box
     )
-    near = _AT_BOUND * scale
+    near = AT_BOUND * scale
     inside = free & (found.theta > low + near) & (found.theta < high - near)
     lags = np.isin(np.arange(_SIZE), _LAGS)
     return FittedImpedance(found.theta, inside, free & lags & (found.theta <= low + near), found.objective, scale)
@@ -518,7 +514,7 @@ class _ThetaSpread:
             dof = max(1.0, min(float(np.sum(shares)) ** 2 / open_share if open_share > 0.0 else 1e6, 1e6))
             half = student_quantile(self._confidence, dof) * math.sqrt(variance)
             if extra_sd is not None:
-                half = math.hypot(half, student_quantile(self._confidence, 1e6) * float(extra_sd[index]))
+                half = math.hypot(half, student_quantile(self._confidence, CERTAIN) * float(extra_sd[index]))
             found.append(Estimate(float(one), float(one - half), float(one + half)))
         if self._other is not None:
             also = self._other.around(function, extra_sd)
@@ -539,7 +535,7 @@ class _ThetaSpread:
             plain = self.around(lambda theta: rows @ theta)
             found = [self._profiled(row, one) for row, one in zip(rows, plain, strict=True)]
             if extra_sd is not None:
-                more = student_quantile(self._confidence, 1e6) * extra_sd
+                more = student_quantile(self._confidence, CERTAIN) * extra_sd
                 found = [Estimate(one.value, max(one.value - math.hypot(one.value - one.low, add), 0.0),
                                   one.value + math.hypot(one.high - one.value, add))
                          for one, add in zip(found, more.tolist(), strict=True)]

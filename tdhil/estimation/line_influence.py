@@ -14,6 +14,8 @@ from tdhil.estimation.result import BudgetLine, Estimate
 from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray
 
+LEAST_PERIODS = 3         # fewest periods in one segment: their scatter is part of the interval
+
 
 def inertia_changes(curve: ModelCurve, theta: FloatArray, torques: Sequence[ComplexArray]) -> FloatArray:
     """Return the change of J, kg·m², by each of P torques that are subtracted, as the parts (P, R) of the R segment

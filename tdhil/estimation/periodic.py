@@ -28,6 +28,7 @@ from tdhil.estimation.cross_checks import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
 from tdhil.estimation.frequency_domain import (
+    LEAST_NU,
     RigidResult,
     ShaftModel,
     contradicted,
@@ -52,7 +53,6 @@ from tdhil.estimation.spectrum import PeriodLines, SpectralLine, period_lines, p
 from tdhil.recording import Excitation
 
 _ROUGH_REL_SD = 0.1       # relative standard uncertainty of the rough inertia as a prior
-_LEAST_NU = 2.0     # least complex degrees of freedom of the weights; with fewer the interval has no meaning
 _BEFORE_ECHO_HELPS = (
     "add --excitation prbs, which uses only the time before the echo. Or lift the bit off bottom, reduce the "
     "weight on it, raise the amplitude, or excite for more periods"
@@ -99,7 +99,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         refuse_stick_slip(case)
     check_lines(case)
     every = case.every
-    if not every or max(line.nu for line in every) < _LEAST_NU:
+    if not every or max(line.nu for line in every) < LEAST_NU:
         raise Refused(
             f"{case.periods_used} usable whole periods are too few to know the scatter",
             "let each mean speed run for four periods or more after settling",
@@ -107,7 +107,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         )
     if _before_echo(case):       # before the echo all lines are used; the likelihood weights each by its uncertainty
         return replace(case, lines=every, usable=every, sound=True)
-    lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
+    lines = tuple(line for line in every if line.excited and line.nu >= LEAST_NU)
     if not lines:
         raise _too_few(
             case, "no excited line is clearly above the scatter", "raise the amplitude, or excite for more periods")
@@ -116,7 +116,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         warnings = (*warnings, CodedText(
             f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used",
             MessageCode.LINES_TOO_WEAK))
-    return replace(case, lines=lines, usable=usable_lines(every, _LEAST_NU), warnings=warnings, sound=True)
+    return replace(case, lines=lines, usable=usable_lines(every, LEAST_NU), warnings=warnings, sound=True)
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ def settled(case: PeriodicCase) -> PeriodicCase:
     """Return the case without the residual oscillation of the shaft (`transient`)."""
     slope = case.constraint.slope if case.constraint is not None else 0.0
     every = settled_lines(case.fits, case.stretches, slope, case.levels.warming.own)
-    usable = usable_lines(every, _LEAST_NU)
+    usable = usable_lines(every, LEAST_NU)
     return replace(case, every=every, usable=usable) if usable else case
 
 

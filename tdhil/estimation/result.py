@@ -54,7 +54,7 @@ class Options:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-_OPEN = 0.5     # half-width over value, beyond which an interval is not reported as a number
+OPEN = 0.5     # half-width over value, beyond which an interval is not reported as a number
 
 
 class Verdict(Enum):
@@ -82,7 +82,7 @@ class Estimate:
     @property
     def bounded(self) -> bool:
         """True if the value is positive and its interval is narrow enough to be reported."""
-        return self.finite and self.value > 0.0 and 0.5 * (self.high - self.low) <= _OPEN * self.value
+        return self.finite and self.value > 0.0 and 0.5 * (self.high - self.low) <= OPEN * self.value
 
 
 @dataclass(frozen=True)

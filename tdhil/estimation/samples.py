@@ -211,7 +211,7 @@ def _samples(count: int) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _LEAST_SHARE = 0.6        # least share of a period's samples
-_LONGEST_GAP = 0.1        # longest gap, as a share of the shortest cycle of the excitation
+LONGEST_GAP = 0.1        # longest gap, as a share of the shortest cycle of the excitation
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,7 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
         if not segment.lines_hz or not (segment.period_s > 0.0 and math.isfinite(segment.period_s)):
             continue
         start, end = excited_window(segment)
-        longest_gap = max(_LONGEST_GAP / max(segment.lines_hz), 3.0 * interval)
+        longest_gap = max(LONGEST_GAP / max(segment.lines_hz), 3.0 * interval)
         last_time = float(samples.time_s[-1]) if len(samples) else start
         # a recording may end a little early, by no more than the longest allowed gap
         end = min(end, last_time + longest_gap)

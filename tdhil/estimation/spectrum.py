@@ -157,9 +157,9 @@ def repeating_rounding(
 
 ComplexArray = NDArray[np.complex128]
 
-_SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
-_BLOCK = 8192             # samples worked on at once
-_FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
+SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
+BLOCK = 8192             # samples worked on at once
+FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
 _BLOCKS_A_CYCLE = 20      # blocks per cycle of the fastest line, at least
 _SAME = 4.0 * float(np.finfo(np.float64).eps)      # relative; closer frequencies count as equal
 
@@ -201,8 +201,8 @@ class SpectralLine:
     @property
     def excited(self) -> bool:
         """True if both signals are clear of their scatter in every segment."""
-        speed_clear = np.abs(self.speed) ** 2 * self.periods > _SIGNIFICANT * self.s_ww
-        torque_clear = np.abs(self.torque) ** 2 * self.periods > _SIGNIFICANT * self.s_tt
+        speed_clear = np.abs(self.speed) ** 2 * self.periods > SIGNIFICANT * self.s_ww
+        torque_clear = np.abs(self.torque) ** 2 * self.periods > SIGNIFICANT * self.s_tt
         return bool(np.all(speed_clear & torque_clear))
 
 
@@ -284,8 +284,8 @@ def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[
     # normal equations are accurate and fast here, because the columns are nearly orthogonal; blocks keep the table of a
     # long period out of memory
     normal, right = np.zeros((1 + 2 * count, 1 + 2 * count)), np.zeros((1 + 2 * count, 3))
-    for first in range(0, len(time), _BLOCK):
-        block = slice(first, first + _BLOCK)
+    for first in range(0, len(time), BLOCK):
+        block = slice(first, first + BLOCK)
         turned = _turned(time[block] - start_s, lines_hz)
         design = np.empty((turned.shape[1], 1 + 2 * count))
         design[:, 0] = 1.0
@@ -368,7 +368,7 @@ def _pool(
     s_tt += float(by_rounding[1])
     mean_speed = np.array([speed.mean() for speed in speeds])
     mean_torque = np.array([torque.mean() for torque in torques])
-    s_ww += _FLOOR * float(np.max(np.abs(mean_speed) ** 2))
-    s_tt += _FLOOR * float(np.max(np.abs(mean_torque) ** 2))
+    s_ww += FLOOR * float(np.max(np.abs(mean_speed) ** 2))
+    s_tt += FLOOR * float(np.max(np.abs(mean_torque) ** 2))
     counts = np.array([float(len(speed)) for speed in speeds])
     return SpectralLine(hertz, mean_speed, mean_torque, counts, s_ww, s_tt, s_tw, nu)

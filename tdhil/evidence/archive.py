@@ -28,6 +28,7 @@ from typing import Any, Final
 
 from tdhil.evidence.drives import CONFIDENCE, agreement_of, shown_entries
 from tdhil.evidence.statement import PARTS, PublisherStatement
+from tdhil.report import SIMULATED
 
 KIND: Final = "tdhil_evidence"
 FORMAT: Final = 1
@@ -37,7 +38,6 @@ README, STATEMENT, IDENTITY, PARAMETERS, PROFILE, RESULT, LOG, MANIFEST = MEMBER
 )
 LARGEST: Final = 2 * 2**30
 """Largest archive that is read, bytes."""
-SIMULATED: Final = "SIMULATED"
 
 _DATE: Final = (1980, 1, 1, 0, 0, 0)
 """Date of each member: the earliest one that ZIP can state."""

@@ -48,9 +48,8 @@ from statistics import NormalDist, median
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from tdhil.recording import FloatArray
 
 ALARM: Final = 0.1
 """Limit for a change: it is reported if the probability of "no change" is below this."""

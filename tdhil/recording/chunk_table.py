@@ -10,7 +10,6 @@ import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from struct import Struct
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,12 +25,11 @@ from tdhil.recording.log_messages import (
     SAMPLE_SIZE,
     TORQUE_MODE,
 )
+from tdhil.recording.mcap_records import CHANNEL, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, SCHEMA
 
-_HEAD: Final = Struct("<BQ")           # opcode:1  length:8
-_MESSAGE_HEAD: Final = 22              # channel:2  sequence:4  log time:8  publish time:8
+_MESSAGE_SIZE: Final = MESSAGE_HEAD.size
 _FEW: Final = 12                       # chunks; for fewer, a loop in Python is faster than numpy
-_MESSAGE: Final = 0x05
-_DECLARING: Final = (0x03, 0x04)       # schema, channel
+_DECLARING: Final = (SCHEMA, CHANNEL)
 
 _HEAD_ROW: Final = np.dtype([("opcode", "u1"), ("length", "<u8")])
 _MESSAGE_ROW: Final = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time_ns", "<u8")])
@@ -104,11 +102,11 @@ class ChunkTable:
         starts = np.concatenate((np.zeros(1, np.int64), ends[:-1]))
         at, opcode, length, whole = _records(self._data, starts, ends)
         chunk_of = np.searchsorted(ends, at, side="right")
-        odd = ((opcode == _MESSAGE) & (length < _MESSAGE_HEAD)) | np.isin(opcode, _DECLARING)
+        odd = ((opcode == MESSAGE) & (length < _MESSAGE_SIZE)) | np.isin(opcode, _DECLARING)
         whole[chunk_of[odd]] = False
         self.plain: tuple[bool, ...] = tuple(whole.tolist())
-        kept = opcode == _MESSAGE
-        self._at, self._length = at[kept] + _HEAD.size, length[kept]
+        kept = opcode == MESSAGE
+        self._at, self._length = at[kept] + RECORD_HEAD.size, length[kept]
         self._rows = np.searchsorted(self._at, np.concatenate((starts, ends[-1:])))
 
     def messages(
@@ -144,21 +142,21 @@ class ChunkTable:
                 return None
         others = np.flatnonzero((number_of != 0) & ~is_sample & ~is_command & ~np.isin(number_of, tuple(skipped)))
         found = [
-            RawMessage(int(number_of[k]), self._data[at[k] + _MESSAGE_HEAD:at[k] + length[k]]) for k in others.tolist()
+            RawMessage(int(number_of[k]), self._data[at[k] + _MESSAGE_SIZE:at[k] + length[k]]) for k in others.tolist()
         ]
         return block, TorqueCommand(*commanded[-1].tolist()), found, bool(number_of.any())
 
     def _commands(self, at: Offsets, length: Offsets, before: TorqueCommand) -> NDArray[np.float64] | None:
         """Return (1 + n, 2) time and torque setpoint (NaN: not in torque mode) of ``before`` and of n commands."""
-        size = length - _MESSAGE_HEAD
+        size = length - _MESSAGE_SIZE
         more = size == COMMAND_SIZE + MORE_SIZE
         if not np.all(more | (size == COMMAND_SIZE)):
             return None
-        rows = _taken(self._data, at + _MESSAGE_HEAD, _COMMAND_ROW)
+        rows = _taken(self._data, at + _MESSAGE_SIZE, _COMMAND_ROW)
         exact = bool(all((rows[name] == tag).all() for name, tag in _COMMAND_TAGS) and (rows["mode"] < 0x80).all())
         if exact and more.any():
             data = np.frombuffer(self._data, np.uint8)
-            exact = bool((data[at[more] + _MESSAGE_HEAD + COMMAND_SIZE] == OFFSET_TAG).all())
+            exact = bool((data[at[more] + _MESSAGE_SIZE + COMMAND_SIZE] == OFFSET_TAG).all())
         if not exact:
             return None
         found = np.empty((1 + len(rows), 2))
@@ -170,15 +168,15 @@ class ChunkTable:
     def _samples(
         self, at: Offsets, length: Offsets, answered: NDArray[np.float64], log_time_ns: int
     ) -> SampleBlock | None:
-        size = length - _MESSAGE_HEAD
+        size = length - _MESSAGE_SIZE
         more = (size - SAMPLE_SIZE) // MORE_SIZE
         if not np.all((size == SAMPLE_SIZE + more * MORE_SIZE) & (more >= 0) & (more <= 2)):
             return None
-        rows = _taken(self._data, at + _MESSAGE_HEAD, _SAMPLE_ROW)
+        rows = _taken(self._data, at + _MESSAGE_SIZE, _SAMPLE_ROW)
         exact = all((rows[name] == tag).all() for name, tag in _TAGS) and all(
             (rows[name] < 0x80).all() for name in _VARINTS)
         one, two = np.flatnonzero(more == 1), np.flatnonzero(more == 2)
-        behind = at + (_MESSAGE_HEAD + SAMPLE_SIZE)
+        behind = at + (_MESSAGE_SIZE + SAMPLE_SIZE)
         single, first = _taken(self._data, behind[one], _MORE_ROW), _taken(self._data, behind[two], _MORE_ROW)
         second = _taken(self._data, behind[two] + MORE_SIZE, _MORE_ROW)
         exact = (
@@ -221,12 +219,12 @@ def _records(
     whole = np.ones(len(starts), np.bool_)
     places, opcodes, lengths = [], [], []
     chunk = np.flatnonzero(starts < ends)
-    at, last = starts[chunk], ends[chunk] - _HEAD.size          # last possible place of a record's head
+    at, last = starts[chunk], ends[chunk] - RECORD_HEAD.size          # last possible place of a record's head
     while len(chunk) >= _FEW:
         room = last - at
         if room.min() < 0:
             going = room >= 0
-            whole[chunk[(room < 0) & (room > -_HEAD.size)]] = False
+            whole[chunk[(room < 0) & (room > -RECORD_HEAD.size)]] = False
             chunk, at, last = chunk[going], at[going], last[going]
             continue
         head = _taken(data, at, _HEAD_ROW)
@@ -238,7 +236,7 @@ def _records(
         places.append(at)
         opcodes.append(head["opcode"])
         lengths.append(length)
-        at = at + (length + _HEAD.size)
+        at = at + (length + RECORD_HEAD.size)
     for one, start in zip(chunk.tolist(), at.tolist(), strict=True):
         found, whole[one] = _walk(data, start, int(ends[one]))
         if found:
@@ -259,7 +257,7 @@ def _walk(data: bytes, at: int, end: int) -> "tuple[array[int], bool]":
     whole.
     """
     found = array("q")
-    unpack, head = _HEAD.unpack_from, _HEAD.size
+    unpack, head = RECORD_HEAD.unpack_from, RECORD_HEAD.size
     while at < end:
         if at + head > end:
             return found, False

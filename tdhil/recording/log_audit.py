@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from struct import Struct
 from typing import Any, Final
 
 import zstandard
@@ -19,17 +18,31 @@ from tdhil.errors import LogBroken
 from tdhil.recording.log_format import CHANNELS, CLASSES, RAW_FRAMES, SAMPLE
 from tdhil.recording.log_reader import Ours, messages
 from tdhil.recording.mcap_container import MAGIC
-from tdhil.recording.mcap_recovery import CHUNK, CHUNK_LIMIT, Contents, chunk_head, contents, read_at
+from tdhil.recording.mcap_records import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MESSAGE,
+    MESSAGE_INDEX,
+    METADATA,
+    RECORD_HEAD,
+    SCHEMA,
+    STATISTICS,
+    SUMMARY_OFFSET,
+)
+from tdhil.recording.mcap_recovery import CHUNK_LIMIT, Contents, chunk_head, contents, read_at
 
-_RECORD: Final = Struct("<BQ")
-_FOOTER: Final = 0x02
-_MESSAGE: Final = 0x05
-_PLAIN: Final = frozenset({0x01, 0x02, 0x03, 0x04, 0x06, 0x07, 0x08, 0x0B, 0x0E, 0x0F})
-"""Records of a finished log: header, footer, declarations, chunks, indexes, statistics. An attachment (09h), metadata
-(0Ch) or a message outside a chunk is none of them."""
-_FOREIGN: Final = {0x09: "an attachment", 0x0C: "metadata"}
-_WITH_TEXT: Final = frozenset({0x01, 0x03, 0x04})
-"""Records with texts: header, schema, channel."""
+_PLAIN: Final = frozenset({
+    HEADER, FOOTER, SCHEMA, CHANNEL, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, SUMMARY_OFFSET, DATA_END})
+"""Records of a finished log: header, footer, declarations, chunks, indexes, statistics. An attachment, metadata
+or a message outside a chunk is none of them."""
+_FOREIGN: Final = {ATTACHMENT: "an attachment", METADATA: "metadata"}
+_WITH_TEXT: Final = frozenset({HEADER, SCHEMA, CHANNEL})
+"""Records with texts."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +63,18 @@ def audit_log(path: Path) -> LogAudit:
     with path.open("rb") as file:
         size = file.seek(0, 2)
         offset, opcode = len(MAGIC), 0
-        while opcode != _FOOTER:
-            head = read_at(file, offset, _RECORD.size)
-            if len(head) < _RECORD.size:
+        while opcode != FOOTER:
+            head = read_at(file, offset, RECORD_HEAD.size)
+            if len(head) < RECORD_HEAD.size:
                 raise LogBroken("its records do not fill the file", where=path.name)
-            opcode, length = _RECORD.unpack(head)
+            opcode, length = RECORD_HEAD.unpack(head)
             if opcode not in _PLAIN:
                 foreign[_FOREIGN.get(opcode, f"record {opcode:02X}h")] = None
             elif opcode in _WITH_TEXT:
-                declarations[read_at(file, offset + _RECORD.size, length)] = None
+                declarations[read_at(file, offset + RECORD_HEAD.size, length)] = None
             elif opcode == CHUNK:
                 counted += _chunk(file, offset, size, foreign, declarations)
-            offset += _RECORD.size + length
+            offset += RECORD_HEAD.size + length
         if offset + len(MAGIC) != size:
             foreign["bytes behind the end"] = None
     if counted != sum(isinstance(one, Ours) for one in messages(path)):
@@ -78,10 +91,10 @@ def _chunk(file: Any, offset: int, size: int, foreign: dict[str, None], declarat
         raise LogBroken("a chunk is damaged", where=Path(file.name).name)
     count, at, data = 0, 0, found.data
     while at < len(data):
-        opcode, length = _RECORD.unpack_from(data, at)
-        body = data[at + _RECORD.size:at + _RECORD.size + length]
-        at += _RECORD.size + length
-        if opcode == _MESSAGE:
+        opcode, length = RECORD_HEAD.unpack_from(data, at)
+        body = data[at + RECORD_HEAD.size:at + RECORD_HEAD.size + length]
+        at += RECORD_HEAD.size + length
+        if opcode == MESSAGE:
             count += 1
         elif opcode in _WITH_TEXT:
             declarations[body] = None

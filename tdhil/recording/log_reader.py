@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from struct import Struct
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable, TorqueCommand
 from tdhil.recording.log_format import CHANNELS, CLASSES, MODE_OF, PACKAGE, RECOVERED, STATE_OF, Event, schema_name
 from tdhil.recording.log_messages import TEXT_LIMIT
 from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.mcap_records import CHANNEL, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, SCHEMA
 from tdhil.recording.mcap_recovery import Contents, Damage, Library, Whole, walk
 from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 
@@ -28,9 +28,6 @@ from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recor
 # Records inside a chunk with a valid CRC. Pure; the bytes may still be hostile.
 
 
-_RECORD = Struct("<BQ")
-_MESSAGE = Struct("<HIQQ")
-SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
 _LONGEST = 128                         # characters of a name; those of tdhil are shorter
 
 
@@ -61,18 +58,18 @@ def records(chunk: bytes) -> Iterator[Schema | Channel | Message]:
     """Yield the records in order; other kinds are skipped. Raises ValueError for a record that exceeds the chunk."""
     offset, size = 0, len(chunk)
     while offset < size:
-        if offset + _RECORD.size > size:
+        if offset + RECORD_HEAD.size > size:
             raise ValueError("a record is cut")
-        opcode, length = _RECORD.unpack_from(chunk, offset)
-        start = offset + _RECORD.size
+        opcode, length = RECORD_HEAD.unpack_from(chunk, offset)
+        start = offset + RECORD_HEAD.size
         offset = start + length
         if offset > size:
             raise ValueError("a record is longer than its chunk")
         if opcode == MESSAGE:
-            if length < _MESSAGE.size:
+            if length < MESSAGE_HEAD.size:
                 raise ValueError("a message is too short")
-            channel, _, log_time_ns, _ = _MESSAGE.unpack_from(chunk, start)
-            yield Message(channel, log_time_ns, chunk[start + _MESSAGE.size:offset])
+            channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(chunk, start)
+            yield Message(channel, log_time_ns, chunk[start + MESSAGE_HEAD.size:offset])
         elif opcode == SCHEMA:
             yield Schema(_number(chunk, start), _string(chunk, start + 2, offset))
         elif opcode == CHANNEL:

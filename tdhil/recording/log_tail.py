@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from struct import Struct
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -23,12 +22,10 @@ from tdhil.recording.builder import structure
 from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable
 from tdhil.recording.log_format import CHANNELS, CLASSES, Event, LiveInertia
 from tdhil.recording.mcap_container import MAGIC
-from tdhil.recording.mcap_recovery import CHUNK, CHUNK_LIMIT, DATA_END, Contents, chunk_head, contents, read_at
+from tdhil.recording.mcap_records import CHUNK, DATA_END, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from tdhil.recording.mcap_recovery import CHUNK_LIMIT, Contents, chunk_head, contents, read_at
 from tdhil.recording.recording import FloatArray, Stage
 
-_RECORD: Final = Struct("<BQ")
-_MESSAGE_HEAD: Final = Struct("<HIQQ")         # channel, sequence, log time, publish time
-_MESSAGE: Final = 0x05
 _NUMBERS: Final = {number: number for number in CHANNELS}
 _SKIPPED: Final = log_format.RAW_FRAMES | {
     log_format.COMMAND, log_format.FRF, log_format.LOG, log_format.VIRTUAL_STRING}
@@ -80,15 +77,15 @@ class LoggedMessage:
 def messages_in(chunk: bytes) -> Iterator[LoggedMessage]:
     """Yield the messages of a chunk in order, without those of other programs' channels."""
     at = 0
-    while at + _RECORD.size <= len(chunk):
-        opcode, length = _RECORD.unpack_from(chunk, at)
-        at, end = at + _RECORD.size, at + _RECORD.size + length
+    while at + RECORD_HEAD.size <= len(chunk):
+        opcode, length = RECORD_HEAD.unpack_from(chunk, at)
+        at, end = at + RECORD_HEAD.size, at + RECORD_HEAD.size + length
         if end > len(chunk):
             return
-        if opcode == _MESSAGE and length >= _MESSAGE_HEAD.size:
-            number, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(chunk, at)
+        if opcode == MESSAGE and length >= MESSAGE_HEAD.size:
+            number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(chunk, at)
             if number in CHANNELS:
-                yield LoggedMessage(number, log_time_ns, chunk[at + _MESSAGE_HEAD.size:end])
+                yield LoggedMessage(number, log_time_ns, chunk[at + MESSAGE_HEAD.size:end])
         at = end
 
 
@@ -138,11 +135,11 @@ class LogTail:
                 return
             self.offset = len(MAGIC)
         while True:
-            head = read_at(file, self.offset, _RECORD.size)
-            if len(head) < _RECORD.size:
+            head = read_at(file, self.offset, RECORD_HEAD.size)
+            if len(head) < RECORD_HEAD.size:
                 return
-            opcode, length = _RECORD.unpack(head)
-            end = self.offset + _RECORD.size + length
+            opcode, length = RECORD_HEAD.unpack(head)
+            end = self.offset + RECORD_HEAD.size + length
             if opcode == DATA_END and length == 4:
                 self.closed = True
                 return

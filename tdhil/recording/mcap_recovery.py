@@ -21,6 +21,17 @@ import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
 from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.mcap_records import (
+    ATTACHMENT,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    KNOWN,
+    MESSAGE_INDEX,
+    METADATA,
+    RECORD_HEAD,
+)
 
 # ---------------------------------------------------------------------------------------------------------------------
 # One chunk of an MCAP file, decompressed within limits that do not depend on its declarations.
@@ -31,9 +42,7 @@ from tdhil.recording.mcap_container import MAGIC
 
 
 CHUNK_LIMIT: Final = 16 * 2**20        # bytes, uncompressed; a power of two, as the window of zstd requires
-CHUNK: Final = 0x06
 CHUNK_HEAD: Final = Struct("<QQQII")
-_RECORD_HEAD: Final = Struct("<BQ")
 
 
 @dataclass(frozen=True)
@@ -68,13 +77,13 @@ class ChunkHead:
 
 def chunk_head(file: BinaryIO, offset: int, size: int) -> ChunkHead | None:
     """Return the chunk record at ``offset``, if its lengths agree with each other and with the file; else None."""
-    head = read_at(file, offset, _RECORD_HEAD.size + CHUNK_HEAD.size + 24)
-    if len(head) < _RECORD_HEAD.size + CHUNK_HEAD.size or head[0] != CHUNK:
+    head = read_at(file, offset, RECORD_HEAD.size + CHUNK_HEAD.size + 24)
+    if len(head) < RECORD_HEAD.size + CHUNK_HEAD.size or head[0] != CHUNK:
         return None
-    _, length = _RECORD_HEAD.unpack_from(head)
-    _, _, uncompressed_size, crc, name_length = CHUNK_HEAD.unpack_from(head, _RECORD_HEAD.size)
-    name_at = _RECORD_HEAD.size + CHUNK_HEAD.size
-    if name_length > 8 or len(head) < name_at + name_length + 8 or offset + _RECORD_HEAD.size + length > size:
+    _, length = RECORD_HEAD.unpack_from(head)
+    _, _, uncompressed_size, crc, name_length = CHUNK_HEAD.unpack_from(head, RECORD_HEAD.size)
+    name_at = RECORD_HEAD.size + CHUNK_HEAD.size
+    if name_length > 8 or len(head) < name_at + name_length + 8 or offset + RECORD_HEAD.size + length > size:
         return None
     name = head[name_at:name_at + name_length].decode("ascii", "replace")
     data_length = int.from_bytes(head[name_at + name_length:name_at + name_length + 8], "little")
@@ -123,12 +132,9 @@ def read_at(file: BinaryIO, offset: int, length: int) -> bytes:
 # ---------------------------------------------------------------------------------------------------------------------
 
 TOTAL_LIMIT: Final = 4 * 2**30
-HEADER, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 0x01, 0x07, 0x09, 0x0C, 0x0F
-_KNOWN: Final = frozenset(range(0x01, 0x10))
-_RECORD: Final = Struct("<BQ")
-_INDEX_HEAD: Final = _RECORD.size + 6                     # channel:2  length of the rest:4
+_INDEX_HEAD: Final = RECORD_HEAD.size + 6                     # channel:2  length of the rest:4
 _NAMES: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
-_FOOTER: Final = _RECORD.pack(0x02, 20)
+_FOOTER: Final = RECORD_HEAD.pack(FOOTER, 20)
 _STEP: Final = 2**20
 
 
@@ -155,8 +161,8 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
     zstd = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT)
     while True:
         head = read_at(file, offset, _INDEX_HEAD)
-        opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
-        end = offset + _RECORD.size + length
+        opcode, length = RECORD_HEAD.unpack_from(head) if len(head) >= RECORD_HEAD.size else (0, 0)
+        end = offset + RECORD_HEAD.size + length
         if (opcode == MESSAGE_INDEX and end <= size and len(head) == _INDEX_HEAD
                 and int.from_bytes(head[-4:], "little") + 6 == length):     # its two lengths agree
             offset = end                    # most records are of this kind
@@ -178,16 +184,16 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
                     return
             yield found
         elif opcode == HEADER and end <= size and length < 4096:
-            body = read_at(file, offset + _RECORD.size, length)     # n:4 profile  n:4 library
+            body = read_at(file, offset + RECORD_HEAD.size, length)     # n:4 profile  n:4 library
             start = 4 + int.from_bytes(body[:4], "little")
             name = body[start + 4:start + 4 + int.from_bytes(body[start:start + 4], "little")]
             yield Library(name.decode("utf-8", "replace"))
-        elif end <= size and _is_added(file, opcode, offset + _RECORD.size, end):
+        elif end <= size and _is_added(file, opcode, offset + RECORD_HEAD.size, end):
             offset = end
             continue
         else:
             found_at = _next_chunk(file, offset + 1, size)
-            cut = found_at is None and (len(head) < _RECORD.size or (opcode in _KNOWN and end > size))
+            cut = found_at is None and (len(head) < RECORD_HEAD.size or (opcode in KNOWN and end > size))
             text = "the file ends in the middle of a record: it was not closed" if cut else "not a record"
             yield Damage(offset, text + ("" if found_at is None or cut else f": {found_at - offset} bytes skipped"))
             if found_at is None:
@@ -214,7 +220,7 @@ def _is_added(file: BinaryIO, opcode: int, start: int, end: int) -> bool:
 
 def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
     """Return the start of the next consistent chunk; None if there is none."""
-    before = _RECORD.size + CHUNK_HEAD.size - 4           # bytes from the chunk's start to the compression's name
+    before = RECORD_HEAD.size + CHUNK_HEAD.size - 4           # bytes from the chunk's start to the compression's name
     while offset < size:
         block = read_at(file, offset, _STEP + before + 8)  # blocks overlap by the size of a chunk's head
         for match in _NAMES.finditer(block, before):

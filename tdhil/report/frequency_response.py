@@ -14,7 +14,7 @@ from rich.text import Text as Words
 from tdhil.report.document import SIMULATED
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
-from tdhil.report.plots import DARK, OURS, PAPER, QUIET
+from tdhil.report.plots import CAPTION_SIGNS, DARK, OURS, PAPER, PNG_DPI, QUIET
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,9 +24,7 @@ Part = Mapping[str, Any]
 
 _ODD, _EVEN = 0.7, 0.3      # share of odd harmonics: above the first "odd", below the second "even" is named
 _COLOURS = (DARK, OURS, PAPER, "#1a7f37", "#7c3aed", "#0e7490")
-_PNG_DPI = 150              # dots per inch of a PNG
 _SIZE_IN = (7.0, 8.6)       # inches, of a figure with all panels
-_CAPTION_SIGNS = 105        # characters in a line of the caption
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -107,7 +105,7 @@ def save_responses(parts: Sequence[tuple[str, Part]], path: Path) -> None:
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         draw_responses(figure, parts)
         metadata = {"Date": None, "Creator": None} if path.suffix.lower() == ".svg" else None
-        figure.savefig(path, dpi=_PNG_DPI, metadata=metadata)
+        figure.savefig(path, dpi=PNG_DPI, metadata=metadata)
 
 
 def draw_faults(figure: FigureBase, found: Part) -> None:
@@ -145,7 +143,7 @@ def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> Non
     axes[0].legend(fontsize="small", loc="best", ncols=2)
     said = response_sentences(parts[0][1]) if len(parts) == 1 else ()
     reading = GRAPHS["response" if len(parts) == 1 else "compare"].reading
-    figure.supxlabel("\n".join(fill(text, _CAPTION_SIGNS) for text in (" ".join(said), reading) if text),
+    figure.supxlabel("\n".join(fill(text, CAPTION_SIGNS) for text in (" ".join(said), reading) if text),
                      fontsize="small")
 
 

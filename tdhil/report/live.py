@@ -19,7 +19,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from drivers import Command, Outcome, Preflight, Sample
+from drivers import SWITCH_S, Command, Outcome, Preflight, Sample
 from profiles import visible
 from profiles.quantities import in_nm
 from tdhil.config import USUAL_STAGE_S
@@ -161,7 +161,6 @@ class PlannedMotion(Protocol):
 _MARKS = {"ok": ("✓", "green"), "degraded": ("~", "yellow"), "aborted": ("✗", "red"), "skipped": ("-", "dim")}
 _REFRESH_S = 0.2
 _LONGEST_FLUSH_S = 2.0
-_SWITCH_S = 0.0005
 
 
 @dataclass(frozen=True)
@@ -202,7 +201,7 @@ class LiveDisplay:
     def __enter__(self) -> LiveDisplay:
         # the control loop must get the interpreter back soon while a picture is drawn
         self._usual_s = sys.getswitchinterval()
-        sys.setswitchinterval(min(self._usual_s, _SWITCH_S))
+        sys.setswitchinterval(min(self._usual_s, SWITCH_S))
         return self
 
     def __exit__(self, *exc: object) -> None:

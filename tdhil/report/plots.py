@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
 
+PNG_DPI = 150             # dots per inch of a PNG
+CAPTION_SIGNS = 105       # characters in a line of a caption
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Figure of a run: speed and torque over time, with its stages and the excited segments shaded.
 

@@ -21,7 +21,7 @@ from tdhil.report.document import marks, only_finite
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.intervals import part_with_interval, table_cell
 from tdhil.report.page import repeatable_figures
-from tdhil.report.plots import plain_ticks
+from tdhil.report.plots import CAPTION_SIGNS, PNG_DPI, plain_ticks
 from tdhil.report.schedule import gain_words, setting_words, settings_section
 from tdhil.soft_torque import DriveSetting
 from tdhil.speed_loop import (
@@ -43,9 +43,6 @@ if TYPE_CHECKING:
 Part = Mapping[str, Any]
 
 _COLOURS = {"present": "0.35", "tuned": "#1f5fa8"}
-_PNG_DPI = 150
-_CAPTION_SIGNS = 105        # characters in a line below the figure
-"""Dots per inch of a PNG."""
 _SIZE_IN = (7.0, 8.4)
 """Size of a figure with all panels, inches."""
 _STEP_POINTS = 300
@@ -346,10 +343,10 @@ def save_loop_picture(document: Part, path: Path) -> None:
         for part, draw, name in ((grid[0], draw_loop, "open_loop"), (grid[1], draw_step, "step")):
             place = figure.add_subfigure(part)
             draw(place, document)
-            place.supxlabel(fill(GRAPHS[name].reading, _CAPTION_SIGNS), fontsize="small")
+            place.supxlabel(fill(GRAPHS[name].reading, CAPTION_SIGNS), fontsize="small")
         metadata = {"Date": None, "Creator": None} if path.suffix.lower() == ".svg" else None
         try:
-            figure.savefig(path, dpi=_PNG_DPI, metadata=metadata)
+            figure.savefig(path, dpi=PNG_DPI, metadata=metadata)
         except OSError as error:
             raise UsageError(f"can't be written ({error.strerror or error})", where=f"--plot {path}",
                              entry=MessageCode.FILE_NOT_WRITABLE) from error

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         refuse_undersampled as refuse_undersampled, refuse_uninformative as refuse_uninformative,
     )
     from tdhil.runner.preconditions import (
-        precondition_warnings as precondition_warnings, refuse_by_plan as refuse_by_plan,
+        WARM_UP as WARM_UP, precondition_warnings as precondition_warnings, refuse_by_plan as refuse_by_plan,
         stops_from_torque_mode as stops_from_torque_mode,
     )
     from tdhil.runner.settings import (
@@ -42,7 +42,7 @@ else:
         "interim": "FollowsInertia Identify Interim interim_answer live_inertia",
         "planning": "NOTHING_TO_EXPECT NOT_PREDICTED Planned plan_acquisition refuse_hopeless refuse_undersampled"
         " refuse_uninformative",
-        "preconditions": "precondition_warnings refuse_by_plan stops_from_torque_mode",
+        "preconditions": "WARM_UP precondition_warnings refuse_by_plan stops_from_torque_mode",
         "settings": "ControlAssumptions ExcitationRequest MEAN_SPEED_SHARES MachineLimits StopRequest",
         "speed_check": "speed_warnings",
         "stage_log": "stage_warnings",

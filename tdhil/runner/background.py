@@ -16,12 +16,11 @@ from contextlib import contextmanager
 from threading import Event, Lock, Thread
 from typing import Any, Generic, TypeVar
 
+from drivers import SWITCH_S
 from tdhil.worker_process import READY, NotSent, WorkerProcess, result_in
 
 T = TypeVar("T")
 
-SWITCH_S = 0.0005
-"""Longest time for which a computing thread of this process may hold the interpreter, s."""
 
 NICE = 10
 """Increment of the process's nice value over the control loop's. The process must still run beside a busy program."""

@@ -16,9 +16,8 @@ from urllib.parse import quote, urlencode
 from drivers import CommunicationLost
 from profiles import message_of
 from tdhil.errors import MessageCode, TdhilError, UsageError, existing_file
-from tdhil.service.limits import REPLY_S
+from tdhil.service.limits import API, REPLY_S
 
-_API: Final = "/api/v1"
 _ARCHIVED: Final[dict[bool, dict[str, Any]]] = {False: {}, True: {"archived": "true"}}
 """Fields of a request without archived runs, and with them."""
 _ENDED: Final = frozenset({"done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"})
@@ -303,7 +302,7 @@ class Client:
     ) -> Any:
         data = json.dumps(body).encode() if isinstance(body, Mapping) else body
         request = urllib.request.Request(
-            f"{self._url}{_API}{path}", data, {**self._headers, **(headers or {})}, method=method
+            f"{self._url}{API}{path}", data, {**self._headers, **(headers or {})}, method=method
         )
         try:
             return self._opener.open(request, timeout=self._timeout_s)

@@ -4,6 +4,8 @@ from typing import Final
 
 from drivers import LONGEST_STOP_S
 
+API: Final = "/api/v1"
+"""Beginning of the path of each request."""
 MEBIBYTE: Final = 2**20
 UPLOAD_LIMIT: Final = 256 * MEBIBYTE
 """Largest uploaded recording, bytes, unless `--upload-limit` states another one. An hour at 1 kHz has about 100 MiB."""

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from tdhil.errors import LogError, MessageCode
 from tdhil.file_hash import sha256_of
@@ -28,10 +28,8 @@ from tdhil.service.annotations import LONGEST_TEXT, one_line, tags_of
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import Conflict, State, now
 from tdhil.service.start_request import ValuesWrong
-from tdhil.service.store import read_json, write_json
+from tdhil.service.store import LOG, read_json, write_json
 from tdhil.service.supervisor import Supervisor
-
-LOG: Final = "run.mcap"
 
 
 class RunRecords:

@@ -16,8 +16,9 @@ from starlette.routing import Route
 from tdhil.errors import TdhilError
 from tdhil.service import schemas
 from tdhil.service.access import principal, require
+from tdhil.service.limits import API
 from tdhil.service.middleware import body_of, error_response
-from tdhil.service.schemas import API, CSRF_HEADER, plain
+from tdhil.service.schemas import CSRF_HEADER, plain
 from tdhil.service.site import Site
 
 

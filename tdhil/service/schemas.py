@@ -21,6 +21,7 @@ from tdhil.service.audit import Broken, Entry
 from tdhil.service.evidence_request import STATEMENT, EvidenceView
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
+from tdhil.service.limits import API
 from tdhil.service.run_filter import SORTS, Summary
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.start_request import TAKEN, option_schema
@@ -829,7 +830,6 @@ ROUTES: Final = (
     Route("GET", "/openapi.json", "openapi", "This document", None, {200: "application/json"}),
 )
 
-API: Final = "/api/v1"
 CSRF_HEADER: Final = "X-CSRF-Token"
 
 

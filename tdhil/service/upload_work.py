@@ -18,9 +18,9 @@ import numpy as np
 from tdhil.config import ASKED_AGAIN, OF_A_TRACE, STATED
 from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.run_state import Told
-from tdhil.service.store import read_json, write_json
+from tdhil.service.store import LOG, read_json, write_json
 from tdhil.service.upload_request import columns_wrong
-from tdhil.service.uploads import LOG, MOTION, TRACE
+from tdhil.service.uploads import MOTION, TRACE
 
 if TYPE_CHECKING:
     from tdhil.recording import FloatArray, Recording, TraceSurvey

@@ -29,7 +29,7 @@ from profiles import visible
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
 from tdhil.service.limits import MEBIBYTE, UPLOAD_LIMIT
 from tdhil.service.run_state import FULL, Conflict, NoRoom, NotThere, Status, Told, TooLarge, now
-from tdhil.service.store import Store, StoredRequest, read_json, write_json
+from tdhil.service.store import LOG, Store, StoredRequest, read_json, write_json
 
 AT_ONCE: Final = 2
 """Largest number of uploads that are received at the same time."""
@@ -44,7 +44,6 @@ LONGEST_NAME: Final = 200
 FINISHED: Final = 100
 """Number of identified uploads whose run is remembered."""
 FOLDER: Final = "uploads"
-LOG: Final = "run.mcap"
 TRACE: Final = "trace.csv"
 """File of a trace, as it was received."""
 MOTION: Final = "excitation.yaml"

@@ -43,13 +43,13 @@ from tdhil.service.access import SOCKET_LOOK_S, Access, principal, require
 from tdhil.service.accounts import Role
 from tdhil.service.door import NO_DESCRIPTOR, Seldom
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
-from tdhil.service.limits import UPLOAD_LIMIT
+from tdhil.service.limits import API, UPLOAD_LIMIT
 from tdhil.service.live_feed import Feed
 from tdhil.service.middleware import RequestGuard, error_response, error_view, off, status_of
 from tdhil.service.page_routes import Pages
 from tdhil.service.run_channel import tell_viewed
 from tdhil.service.run_state import NotLoggedIn, NotThere, disk_full
-from tdhil.service.schemas import API, SOCKETS
+from tdhil.service.schemas import SOCKETS
 from tdhil.service.site import Site
 from tdhil.service.supervisor import Supervisor
 

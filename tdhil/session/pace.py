@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers import Command, DriveLimits, Mode, Paced
 from tdhil.buses import Connection
 from tdhil.config import Rig, RunOptions, require_limits, simulated_default_rig
+from tdhil.runner import WARM_UP
 from tdhil.session.open_drive import opened_drive, plan_peer
 from tdhil.session.task import suited
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 MEASURED_S: Final = 1.5
 """Length of the measurement, s: a page waits for it."""
-WARM_UP: Final = 10
-"""Cycles before the measurement: the first ones load modules."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.soft_torque.drill_string import NOISE_CORRELATION_S, BitFriction, DrillString
+from tdhil.soft_torque.simulation import Array
 from tdhil.soft_torque.torsional_severity import (
     STICK_SLIP_INDEX,
     SeverityRefused,
@@ -41,7 +42,6 @@ from tdhil.soft_torque.torsional_severity import (
 from tdhil.soft_torque.tuned_figures import in_squares, string_modes_hz
 from tdhil.soft_torque.uncertainty import COVERAGE_K, Interval, StringFactors
 
-Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 SEGMENT_PERIODS = 6.0

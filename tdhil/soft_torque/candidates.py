@@ -19,15 +19,12 @@ from functools import cache
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, impedance
 from tdhil.soft_torque.critical_speed import longest_integral_time_s
 from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
-from tdhil.soft_torque.stability import bit_grid, bit_impedance, chain_of, linear_limit_rad_s, steepest_slope
+from tdhil.soft_torque.stability import Reals, bit_grid, bit_impedance, chain_of, linear_limit_rad_s, steepest_slope
 from tdhil.soft_torque.uncertainty import Truth
-
-Reals = NDArray[np.float64]
 
 SOFTNESSES = tuple(float(one) for one in np.geomspace(0.05, 2.0, 17))
 FREQUENCY_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15)

@@ -42,16 +42,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import ceil, e, pi, sqrt
+from math import ceil, e, sqrt
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from profiles.quantities import RAD_S_PER_RPM
 from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import DrillString
 
-RPM = 2.0 * pi / 60.0
+RPM = RAD_S_PER_RPM
 """One revolution per minute, rad/s."""
 LONGEST_TICK_S = 0.006
 SHORTEST_TICK_S = 0.002

@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 from profiles import MessageCode, TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive, reflection_at
 from tdhil.soft_torque.drill_string import DrillString
+from tdhil.soft_torque.simulation import Array
 from tdhil.soft_torque.tuned_figures import in_squares, string_modes_hz
 from tdhil.soft_torque.uncertainty import Interval, StringFactors, student_factor
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 STEPS_PER_PERIOD = 80.0

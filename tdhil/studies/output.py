@@ -25,7 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tdhil.csv_text import cell_of
-from tdhil.report import STYLE, install_command, repeatable_figures
+from tdhil.report import SIMULATED, STYLE, install_command, repeatable_figures
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -210,7 +210,6 @@ MARKS: dict[bool | None, tuple[str, str, str]] = {
     False: ("✗", "does not hold", "red"),
     None: ("~", "open: the paper contradicts itself or leaves out what decides", "yellow"),
 }
-SIMULATED = "SIMULATED"
 _GAP = 2          # characters between columns
 
 

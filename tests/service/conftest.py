@@ -22,9 +22,9 @@ from starlette.testclient import TestClient
 from tdhil.errors import TdhilError
 from tdhil.service.access import Access
 from tdhil.service.audit import Audit
+from tdhil.service.limits import API
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import Told
-from tdhil.service.schemas import API
 from tdhil.service.start_request import Rigs
 from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor

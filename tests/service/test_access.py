@@ -24,8 +24,8 @@ from tdhil.service import supervisor as supervisor_module
 from tdhil.service import web as web_module
 from tdhil.service.access import SESSION_S, STOPS_S, Access, RequestPace, Tries, address_of
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
+from tdhil.service.limits import API
 from tdhil.service.run_state import NotAllowed, TooManyRuns, TooManyTries
-from tdhil.service.schemas import API
 from tdhil.service.start_request import edited
 from tdhil.session import hold
 from tests.service.conftest import Service, wait_for

@@ -23,9 +23,10 @@ from tdhil.config.options import OPTION, OPTIONS, Form
 from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
 from tdhil.runner.stages.speed import mean_speeds
+from tdhil.service.limits import API
 from tdhil.service.run_filter import RunFilter
 from tdhil.service.run_state import State
-from tdhil.service.schemas import API, ROUTES, SOCKETS, document
+from tdhil.service.schemas import ROUTES, SOCKETS, document
 from tdhil.session.task import machine_limits
 from tests.service.conftest import HANGS_S, URL, Service, wait_for
 

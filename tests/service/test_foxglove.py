@@ -26,7 +26,7 @@ from tdhil.recording.log_format import Event
 from tdhil.service import foxglove
 from tdhil.service import web as web_module
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
-from tdhil.service.schemas import API
+from tdhil.service.limits import API
 from tdhil.service.server import _listen
 from tdhil.service.web import Web
 from tests.recording.test_log_tail import COMMAND, sample, write

@@ -16,9 +16,9 @@ from starlette.websockets import WebSocketDisconnect
 from drivers import CommunicationLost
 from tdhil.cli.main import main
 from tdhil.recording import LiveInertia, LogNews
+from tdhil.service.limits import API
 from tdhil.service.live_feed import EVERY_S, MOST, SPACING_S, Feed, LivePicture
 from tdhil.service.run_state import Entered, State, Status
-from tdhil.service.schemas import API
 from tests.recording.test_log_tail import write
 from tests.service.conftest import URL
 

@@ -14,7 +14,7 @@ import pytest
 from tdhil.errors import ExitCode, LogError
 from tdhil.service import run_state, server, store, supervisor
 from tdhil.service.audit import Audit
-from tdhil.service.schemas import API
+from tdhil.service.limits import API
 from tdhil.service.store import CONNECTION_FILE
 from tests.service.conftest import wait_for
 

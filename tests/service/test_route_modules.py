@@ -6,7 +6,8 @@ from collections import Counter
 
 from starlette.routing import Route
 
-from tdhil.service.schemas import API, ROUTES, SOCKETS
+from tdhil.service.limits import API
+from tdhil.service.schemas import ROUTES, SOCKETS
 
 
 def test_every_declared_route_is_served_once_and_no_other_is(service):

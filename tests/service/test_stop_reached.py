@@ -15,8 +15,8 @@ import pytest
 from drivers import LONGEST_STOP_S
 from tdhil.service import client as client_module
 from tdhil.service import supervisor as supervisor_module
+from tdhil.service.limits import API
 from tdhil.service.run_state import State
-from tdhil.service.schemas import API
 from tdhil.service.site import STOPS
 from tdhil.service.store import CONNECTION_FILE, write_json
 from tdhil.session import hold, kept_connection

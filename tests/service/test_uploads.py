@@ -14,7 +14,7 @@ from starlette.requests import ClientDisconnect
 from starlette.testclient import TestClient
 
 from tdhil.service import upload_routes, uploads
-from tdhil.service.schemas import API
+from tdhil.service.limits import API
 from tdhil.service.uploads import KEPT_FREE, WAITING, shown_name
 from tests.service.conftest import URL, Service, play_uploads, wait_for
 

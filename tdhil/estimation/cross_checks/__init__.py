@@ -1,8 +1,8 @@
 """Cross-checks of a result: J by other routes through the same run, and the friction curve."""
 
 from tdhil.estimation.cross_checks.angle_agreement import (
-    AngleRatio as AngleRatio, angle_checked as angle_checked, angle_ratios as angle_ratios,
-    mean_speed as mean_speed,
+    RATIOS_ALIKE as RATIOS_ALIKE, AngleRatio as AngleRatio, angle_checked as angle_checked,
+    angle_ratios as angle_ratios, mean_speed as mean_speed,
 )
 from tdhil.estimation.cross_checks.friction_by_speed import Inertia as Inertia, friction_curve as friction_curve
 from tdhil.estimation.cross_checks.level_torque import level_checked as level_checked

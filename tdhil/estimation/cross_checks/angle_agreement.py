@@ -17,6 +17,7 @@ import numpy as np
 from profiles import MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.cross_checks.momentum import LONGEST_GAP_S
 from tdhil.estimation.result import Refusal
 from tdhil.estimation.samples import LONGEST_LAG_S, Samples, acquisitions, excited_window, usable_samples
 from tdhil.recording import Recording
@@ -24,8 +25,7 @@ from tdhil.recording import Recording
 _END_S = 0.5              # s; time at either end of a stretch over which its speed is averaged
 _LEAST_S = 2.0            # s; least duration of a stretch
 _LEAST_READINGS = 8       # fewest readings of the angle in a stretch
-_LONGEST_GAP_S = 0.3      # s; longest gap in the speed: over a longer one the travel is unknown
-_ALIKE = 0.02             # largest relative difference between the ratios of two stages, as both are rounded
+RATIOS_ALIKE = 0.02             # largest relative difference between the ratios of two stages, as both are rounded
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: flo
         return None
     begin, end = float(time[0]), float(time[-1])
     inside = samples.between(begin - 1e-9, end + 1e-9)
-    if len(inside) < _LEAST_READINGS or float(np.max(np.diff(inside.time_s), initial=0.0)) > _LONGEST_GAP_S:
+    if len(inside) < _LEAST_READINGS or float(np.max(np.diff(inside.time_s), initial=0.0)) > LONGEST_GAP_S:
         return None
     way = float(np.trapezoid(inside.speed_rad_s, inside.time_s))
     # a sample may be missing at either end; the speed is taken as constant there
@@ -80,7 +80,7 @@ def mean_speed(recording: Recording, start_s: float, end_s: float) -> tuple[floa
     if len(inside) < _LEAST_READINGS:
         return None
     gaps = np.diff(inside.time_s, prepend=start_s, append=end_s)
-    if float(np.max(gaps)) > _LONGEST_GAP_S:
+    if float(np.max(gaps)) > LONGEST_GAP_S:
         return None
     time, speed = inside.time_s, inside.speed_rad_s
     way = float(np.trapezoid(speed, time)) + float(speed[0]) * float(gaps[0]) + float(speed[-1]) * float(gaps[-1])
@@ -133,7 +133,7 @@ def angle_contradiction(recording: Recording) -> Refusal | None:
                 entry=MessageCode.SPEED_SCALE_DOUBTFUL,
             )
         for other in (*steady, *excited):
-            if abs(one.value - other.value) > _ALIKE * abs(other.value) + one.half_width + other.half_width:
+            if abs(one.value - other.value) > RATIOS_ALIKE * abs(other.value) + one.half_width + other.half_width:
                 return Refusal(
                     "the scale of the reported speed changed during the run. The angle over the integral of the "
                     f"reported speed is {one.value:.4g} ± {one.half_width:.2g} in {one.where} and "

@@ -164,7 +164,7 @@ def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]
 # knot of length a covary by D a/6, since ∫ u (1 − u) du = 1/6.
 
 
-_LONGEST_GAP_S = 0.3      # s; longest time without a sample
+LONGEST_GAP_S = 0.3      # s; longest time without a sample
 _CHUNK = 65_536           # samples worked on at once, to limit the memory for a long row
 
 
@@ -218,7 +218,7 @@ def balance(samples: Samples, first: Knot, second: Knot) -> BalanceRow | None:
     for at in range(begin, end, _CHUNK):
         part = slice(at, min(at + _CHUNK, end))
         time, cells, longest = _cells(samples.time_s, part)
-        if longest > _LONGEST_GAP_S:
+        if longest > LONGEST_GAP_S:
             return None
         weight = cells
         if not first.end_s <= time[0] <= time[-1] <= second.start_s:

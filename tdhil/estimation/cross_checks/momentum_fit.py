@@ -14,12 +14,12 @@ from itertools import pairwise
 import numpy as np
 
 from tdhil.estimation.cross_checks.momentum import KNOT_S, BalanceKind, BalanceRow, Balances, overlap_s
-from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
+from tdhil.estimation.frequency_domain import CERTAIN, fisher_tail, student_quantile
 from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01     # p-value below which the rows scatter more than the operating points
-_LEAST_DOF = 3.0          # least degrees of freedom of a scatter that is used
+LEAST_DOF = 3.0          # least degrees of freedom of a scatter that is used
 _BEND_SHOWS = 6.6         # of the density: decrease that shows nonlinear friction, χ² of one degree at 1 %
 _UNSEEN_BEND = 0.03       # of J: standard deviation of the effect of undetected nonlinear friction on a balance
 _LEAST_CHANGE = 0.1       # of the highest speed: rows with a smaller change of speed determine J too poorly
@@ -143,7 +143,7 @@ def fit_momentum(
     scatter = math.sqrt(density.value * float(spread[0, 0]))
     half = math.hypot(
         student_quantile(confidence, density.dof) * scatter,
-        student_quantile(confidence, 1e6) * math.hypot(shifted, rounding),
+        student_quantile(confidence, CERTAIN) * math.hypot(shifted, rounding),
     )
     bent = _bent(solve, rows, delay.seconds, float(x[0]), further, prior, rest, density.value)
     return MomentumFit(float(x[0]), half, shifted, float(x[1]), count, density, bent)
@@ -184,7 +184,7 @@ def _design(rows: list[BalanceRow], delay_s: float, direction: float, share: flo
 def _pooled(levels: Density, rest: float, left: int) -> Density | None:
     own = rest / left if left > 0 else 0.0
     if levels.dof < 1.0 or not levels.value > 0.0:
-        return Density(own, float(left)) if left >= _LEAST_DOF else None
+        return Density(own, float(left)) if left >= LEAST_DOF else None
     if left > 0 and fisher_tail(own / levels.value, left, levels.dof) < _ROWS_DIFFER_P:
         return Density(own, float(left))
     total = levels.dof + left

@@ -20,7 +20,7 @@ import numpy as np
 from tdhil.estimation.cross_checks.momentum import block_means, calm_spans, periodic_segments
 from tdhil.estimation.cross_checks.momentum_fit import Delay, Density, MomentumFit
 from tdhil.estimation.cross_checks.speed_loop import lagged
-from tdhil.estimation.frequency_domain import student_quantile
+from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
 from tdhil.estimation.samples import Samples, usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare
 from tdhil.recording import FloatArray, Recording
@@ -92,6 +92,6 @@ def run_up_inertia(
     shifted = abs(float(later[0][0] - x[0]))
     half = noise * inertia + math.hypot(
         student_quantile(confidence, dof) * math.sqrt(density.value / block_s * float(spread[0, 0])),
-        student_quantile(confidence, 1e6) * math.hypot(shifted, math.hypot(reading.value, reading.sd) * inertia),
+        student_quantile(confidence, CERTAIN) * math.hypot(shifted, math.hypot(reading.value, reading.sd) * inertia),
     )
     return MomentumFit(inertia, half, shifted, float(x[1]), 1, density, _MODEL_SD * inertia)

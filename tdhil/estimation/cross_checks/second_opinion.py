@@ -23,6 +23,7 @@ from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_cu
 from tdhil.estimation.cross_checks.level_torque import least_torque_scale_change
 from tdhil.estimation.cross_checks.momentum import BalanceKind, Balances, balances
 from tdhil.estimation.cross_checks.momentum_fit import (
+    LEAST_DOF,
     UNKNOWN_DELAY,
     Delay,
     Density,
@@ -32,14 +33,12 @@ from tdhil.estimation.cross_checks.momentum_fit import (
 )
 from tdhil.estimation.cross_checks.run_up import run_up_inertia
 from tdhil.estimation.cross_checks.speed_loop import speed_loop
-from tdhil.estimation.frequency_domain import student_quantile
-from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
+from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
+from tdhil.estimation.result import OPEN, Estimate, Refusal, SecondOpinion, normal_quantile
 from tdhil.estimation.samples import acquisitions, usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
-_LEAST_DOF = 3.0          # least degrees of freedom of a scatter that is used
-_OPEN = 0.5               # half-width over J, beyond which there is no cross-check
 _FALSE_ALARM = 0.01       # share of sound runs with a false warning; more frequent warnings would be ignored
 _WORTH_A_FIT = 0.005
 """Least share of J that reading in step may add with a usual speed loop, for a fit of the drive's own loop."""
@@ -121,7 +120,7 @@ def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) 
         known = opinions[0].inertia_kg_m2
     if known is None:
         return None
-    sd = 0.5 * (known.high - known.low) / student_quantile(case.options.confidence, 1e6)
+    sd = 0.5 * (known.high - known.low) / student_quantile(case.options.confidence, CERTAIN)
     finite = math.isfinite(known.value) and math.isfinite(sd)
     return Inertia(known.value, sd, known_delay(case.recording, finding)) if finite else None
 
@@ -136,7 +135,7 @@ def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
 def _fitted_opinions(case: Case, finding: Finding, *, alone: bool = False) -> Fitted:
     levels = case.levels
     try:
-        found = balances(case.recording, case.samples, alone=alone or levels is None or levels.dof < _LEAST_DOF)
+        found = balances(case.recording, case.samples, alone=alone or levels is None or levels.dof < LEAST_DOF)
         opinions = () if found is None else _opinions(case, found, finding)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
         return ()
@@ -197,7 +196,7 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
 
 def _own_inertia(fit: MomentumFit) -> Estimate | None:
     """Return J of a fit with its interval; None if its interval is open."""
-    if not fit.half_width < _OPEN * fit.inertia:
+    if not fit.half_width < OPEN * fit.inertia:
         return None
     return Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
 
@@ -212,7 +211,7 @@ def _least_scale_change(
     """
     own = _bent_by(found[0].inertia_kg_m2, found[1], confidence)
     half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low)) / reference.value
-    hides = student_quantile(2.0 * _DETECTED - 1.0, 1e6) / student_quantile(confidence, 1e6)
+    hides = student_quantile(2.0 * _DETECTED - 1.0, CERTAIN) / student_quantile(confidence, CERTAIN)
     return max(_ALIKE, _times_wider(confidence, _CONTRADICTION / count) * half) + hides * half
 
 
@@ -287,7 +286,7 @@ def _moment(finding: Finding) -> ReadMoment | None:
     skew, lag = finding.skew_s, finding.torque_lag_s
     if skew is None or lag is None or not (skew.finite and lag.finite):
         return None
-    return ReadMoment(skew.value, 0.5 * (skew.high - skew.low) / student_quantile(0.95, 1e6), max(lag.value, 0.0))
+    return ReadMoment(skew.value, 0.5 * (skew.high - skew.low) / student_quantile(0.95, CERTAIN), max(lag.value, 0.0))
 
 
 def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
@@ -316,7 +315,7 @@ def known_delay(recording: Recording, finding: Finding) -> Delay:
     if speed is not None and torque is not None and skew is not None:
         value = speed.value - torque.value - skew.value
         halves = [0.5 * (part.high - part.low) for part in (speed, torque, skew)]
-        sd = math.hypot(*halves) / student_quantile(0.95, 1e6)
+        sd = math.hypot(*halves) / student_quantile(0.95, CERTAIN)
         if math.isfinite(value) and sd < UNKNOWN_DELAY.sd_s:
             return Delay(value, sd, True)
     prior = recording.lag_prior
@@ -356,7 +355,7 @@ def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: floa
 
 
 def _times_wider(confidence: float, miss_share: float) -> float:
-    return student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
+    return student_quantile(1.0 - miss_share, CERTAIN) / student_quantile(confidence, CERTAIN)
 
 
 def _note(fit: MomentumFit, kind: BalanceKind, delay: Delay) -> str:

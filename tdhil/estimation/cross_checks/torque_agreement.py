@@ -27,6 +27,10 @@ from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, Refused, TorqueRatio, normal_quantile
 from tdhil.estimation.samples import Samples, excited_window, good_samples, usual_interval
 from tdhil.estimation.time_domain import (
+    CLEAR,
+    LEAST_BINS,
+    LEAST_DOF,
+    NARROW,
     Bins,
     OneWayStretch,
     joined,
@@ -45,15 +49,11 @@ from tdhil.recording import BoolArray, FloatArray, Recording
 _RATE_HZ = 50.0           # Hz; rate of the compared averages. Both signals have the same average, so its effect cancels
 _GAP_STEPS, _GAP_S = 4.5, 0.05     # missing samples, s; a longer gap begins a new stretch
 _LEAST_S = 4.0            # s; least duration of a stretch; a shorter one has no frequencies below those of the lags
-_LEAST_BINS = 8           # fewest frequencies for a fit
 _ROUNDS = 4               # rounds of reweighting
-_CLEAR = 20.0             # least power that the reference explains, over that of the residual
-_NARROW = 0.05            # of the frequency: width over which the explained power is averaged
 _PHASE_RAD = 0.9          # rad; phase of the lags up to which a cubic is their inverse
 _LEAST_LAG_S = 0.02       # s; least lag used for the bounds of its square and cube
 _SQUARE, _SQUARE_SD = 0.25, 0.2        # a₂/a₁²: one pole 0, two poles up to 1/4, moving average 1/3, dead time 1/2
 _CUBE, _CUBE_SD = 0.05, 0.06           # a₃/a₁³: one and two poles 0, dead time 1/6
-_LEAST_DOF = 3.0          # least degrees of freedom for the quantile
 _RATIO, _OFFSET, _FIRST, _SECOND, _THIRD = range(5)
 
 
@@ -76,7 +76,7 @@ def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) 
     bins = joined([
         measure(window) for window in place_windows(tuple(_stretches(Samples(time_s, reference_nm, torque_nm))))
     ])
-    if len(bins) < _LEAST_BINS:
+    if len(bins) < LEAST_BINS:
         return None
     keep = np.ones(len(bins), dtype=np.bool_)
     variance = bins.energy.copy()
@@ -91,10 +91,10 @@ def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) 
         left = _left(bins, x)
         power, _ = smoothed(bins.hertz, np.abs(left) ** 2 / (bins.energy * np.maximum(1.0 - taken, 0.05)))
         variance = bins.energy * np.maximum(power, 1e-12 * float(np.max(np.abs(bins.torque[:, 0]) ** 2 / bins.energy)))
-        explained, _ = smoothed(bins.hertz, np.abs(x[_RATIO] * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
-        keep = explained * bins.energy > _CLEAR * variance
+        explained, _ = smoothed(bins.hertz, np.abs(x[_RATIO] * bins.speed[:, 0]) ** 2 / bins.energy, NARROW)
+        keep = explained * bins.energy > CLEAR * variance
         keep &= bins.hertz <= _PHASE_RAD / (2.0 * math.pi * max(lag_s, _LEAST_LAG_S))
-        if np.count_nonzero(keep) < _LEAST_BINS:
+        if np.count_nonzero(keep) < LEAST_BINS:
             return None
     chosen, variance = bins.chosen(keep), variance[keep]
     x, spread, _ = _solved(chosen, variance, lag_s, bounded=True)
@@ -103,7 +103,7 @@ def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) 
     seen = float(np.sum(np.abs(x[_RATIO] * chosen.speed[:, 0]) ** 2 / variance))
     lean = abs(float(x[_RATIO])) * len(chosen) / seen
     sd = math.sqrt(max(float(spread[_RATIO, _RATIO]), 0.0))
-    return _RatioFit(float(x[_RATIO]), sd, max(2.0 * len(chosen) - len(x), _LEAST_DOF), lean)
+    return _RatioFit(float(x[_RATIO]), sd, max(2.0 * len(chosen) - len(x), LEAST_DOF), lean)
 
 
 def _stretches(samples: Samples) -> Iterator[OneWayStretch]:

@@ -20,10 +20,12 @@ from tdhil.estimation.frequency_domain.frequency_response import (
     ModelCurve as ModelCurve, measure_response as measure_response,
 )
 from tdhil.estimation.frequency_domain.inference import (
-    contradicted as contradicted, estimate as estimate, fisher_tail as fisher_tail, profile_edge as profile_edge,
+    AT_BOUND as AT_BOUND, CERTAIN as CERTAIN, contradicted as contradicted, estimate as estimate,
+    fisher_tail as fisher_tail, profile_edge as profile_edge,
     student_quantile as student_quantile, torque_scale_line as torque_scale_line,
     widened_most_by_scale as widened_most_by_scale, with_total as with_total,
 )
+from tdhil.estimation.frequency_domain.likelihood import LEAST_NU as LEAST_NU
 from tdhil.estimation.frequency_domain.model import GaussianPrior as GaussianPrior, Model as Model
 from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent as identify_bent
 from tdhil.estimation.frequency_domain.optimiser import Box as Box, Fit as Fit, descend as descend

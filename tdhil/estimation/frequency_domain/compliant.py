@@ -41,6 +41,7 @@ from tdhil.estimation.frequency_domain.inference import (
     student_quantile,
     torque_scale_line,
 )
+from tdhil.estimation.frequency_domain.likelihood import LEAST_NU
 from tdhil.estimation.frequency_domain.model import GaussianPrior
 from tdhil.estimation.frequency_domain.optimiser import Fixed
 from tdhil.estimation.frequency_domain.rigid import (
@@ -74,7 +75,7 @@ from tdhil.estimation.frequency_domain.shafts import (
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.result import DOUBT_P, REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
-from tdhil.estimation.spectrum import SpectralLine
+from tdhil.estimation.spectrum import SIGNIFICANT, SpectralLine
 from tdhil.recording import Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -96,7 +97,6 @@ _DOUBT = 0.3                 # p of the residual test above which a rigid shaft 
 _MUCH = 9.0                  # gain of −2 ln L, for one parameter more than the lags of the rigid shaft have
 _REPORTS = 3                 # unknowns besides the shaft: two lags and the skew
 _BY_PIPE = 2                 # parameters known with a known pipe: its inertia and its stiffness
-_SIGNIFICANT = 25.0          # |mean|² over its variance, as in `SpectralLine.excited`
 _LEAST_LOAD = 0.01           # of the total: a smaller load depends on the error of one line
 _NEAR = (SLOWEST_SEEN, 2.0)  # visible oscillations: multiples of the lowest and the highest line
 
@@ -126,8 +126,8 @@ def usable_lines(every: tuple[SpectralLine, ...], least_nu: float) -> tuple[Spec
     The likelihood treats both in the same way, so one is enough.
     """
     return tuple(line for line in every if line.nu >= least_nu and np.all(
-        (np.abs(line.speed) ** 2 * line.periods > _SIGNIFICANT * line.s_ww)
-        | (np.abs(line.torque) ** 2 * line.periods > _SIGNIFICANT * line.s_tt)))
+        (np.abs(line.speed) ** 2 * line.periods > SIGNIFICANT * line.s_ww)
+        | (np.abs(line.torque) ** 2 * line.periods > SIGNIFICANT * line.s_tt)))
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,6 @@ def _scaled_pipe(standing: _LoadWalk, near: CompliantFit | None) -> tuple[Compli
 
 
 _BY_THE_SWING = 0.1          # of its frequency: distance of the line from the oscillation
-_LEAST_NU = 2.0              # least complex degrees of freedom of a difference: the tails of the likelihood need them
 
 
 def _try_by_difference(standing: _LoadWalk) -> _LoadWalk:
@@ -307,7 +306,7 @@ def _by_difference(line: SpectralLine) -> SpectralLine:
     if fisher_tail(ratio, 2.0 * free, 2.0 * line.nu) >= REJECT_P:
         return line
     return replace(line, s_ww=ratio * line.s_ww, s_tt=ratio * line.s_tt, s_tw=ratio * line.s_tw,
-                   nu=max(float(free), _LEAST_NU))
+                   nu=max(float(free), LEAST_NU))
 
 
 def may_swing(rigid: RigidResult) -> bool:

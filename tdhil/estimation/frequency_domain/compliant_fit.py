@@ -16,11 +16,11 @@ from tdhil.estimation.frequency_domain.shafts import (
     DAMPING,
     INERTIA,
     LOAD,
+    RIGID_COUNT,
     STRING_SHARE,
     SWING,
     VISCOUS,
     Believing,
-    RigidShaft,
     Shaft,
     string_resonances,
     string_stiffness,
@@ -313,7 +313,6 @@ def viewed(fitted: FittedModel, view: ParameterView) -> FittedModel:
 # ---------------------------------------------------------------------------------------------------------------------
 
 SLOWEST_SEEN = 0.5        # of the lowest line: a slower oscillation is not visible
-_RIGID = len(RigidShaft.names)
 _HEAVIER = (0.02, 0.2, 0.4, 0.7)      # shares of the load at the start of a string's descents; the first: two masses
 
 
@@ -361,7 +360,7 @@ def fit_compliant(
     ``near``: two lumps already fitted, which give additional starts for a string.
     """
     model = Model(shaft)
-    moved = model.mechanical - _RIGID
+    moved = model.mechanical - RIGID_COUNT
     priors = tuple(replace(prior, index=prior.index + moved) for prior in priors)
     fixed = {index + moved: value for index, value in fixed.items()}
     problem = Likelihood(lines, model, constraint, priors)

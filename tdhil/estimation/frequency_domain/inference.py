@@ -36,7 +36,7 @@ from tdhil.recording import FloatArray
 # for each free parameter, except for parameters at a bound.
 
 
-_AT_BOUND = 1e-6      # of the natural scale: nearer to a bound counts as at the bound
+AT_BOUND = 1e-6      # of the natural scale: nearer to a bound counts as at the bound
 
 
 def residual_of(fitted: FittedModel, chosen: int = 0) -> ResidualTest | None:
@@ -45,7 +45,7 @@ def residual_of(fitted: FittedModel, chosen: int = 0) -> ResidualTest | None:
     ``chosen``: number of parameters fitted in addition, by a choice among models.
     """
     theta, limits = fitted.whole.theta, fitted.limits
-    near = _AT_BOUND * limits.scale
+    near = AT_BOUND * limits.scale
     inside = (theta > limits.low + near) & (theta < limits.high - near)
     return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])) + chosen)
 
@@ -288,12 +288,13 @@ def half_width_first_order(fitted: FittedModel, index: int, confidence: float, k
 # Torque scale of the drive, to which J is proportional: its effect on an interval, and its line of the budget.
 
 
-_CERTAIN = 1e6      # degrees of freedom: a data sheet's value is assumed to be normally distributed
+CERTAIN = 1e6
+"""Degrees of freedom that count as infinite: those of an input whose stated uncertainty is taken as exact."""
 
 
 def scale_half_width(value: float, rel_sd: float, confidence: float) -> float:
     """Return the half-width, from the torque scale alone, of a quantity proportional to the scale."""
-    return student_quantile(confidence, _CERTAIN) * rel_sd * abs(value)
+    return student_quantile(confidence, CERTAIN) * rel_sd * abs(value)
 
 
 def with_total(

@@ -29,6 +29,9 @@ from tdhil.recording import FloatArray
 
 _SERIES = 1e-4          # q/ν below which a series is used
 
+LEAST_NU = 2.0
+"""Least complex degrees of freedom ν of a line's weight. With fewer, the tails of the likelihood give no interval."""
+
 
 @dataclass(frozen=True)
 class TorqueLoad:

@@ -27,7 +27,7 @@ from tdhil.estimation.frequency_domain.likelihood import Likelihood, TorqueLoad
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.optimiser import Fit, Fixed, box, minimise, rigid_rivals, rough_inertia_of
 from tdhil.estimation.frequency_domain.rigid import RIGID, RigidResult, lags_of, rigid_finding
-from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
+from tdhil.estimation.frequency_domain.shafts import INERTIA, RIGID_COUNT, VISCOUS, RigidShaft
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, slope_over_speed, tie_viscous
 from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest, rejects
 from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
@@ -200,7 +200,6 @@ def wave_of(fit: PeriodLines, segment: Segment) -> SegmentWave:
 
 
 _ROUNDS = 3               # rounds of reweighting
-_RIGID = len(RigidShaft.names)
 _HOPELESS = 40.0    # of −2 ln L behind the best with first-order lags: such a shape is dropped
 _FINE = 0.0005       # of a bell's width: tolerance of its search
 _SHORT_S = 0.02     # s; a shorter common lag hardly changes the wave
@@ -239,7 +238,7 @@ def fit_bends(motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fix
     starts = starts_of(motion, rigid.fitted.simple.theta)
     if not starts or len({float(np.sign(wave.mean)) for wave in motion.waves}) != 1:
         return []
-    speeds = [wave.over_period(start[_RIGID:]) * np.sign(wave.mean) for start in starts for wave in motion.waves]
+    speeds = [wave.over_period(start[RIGID_COUNT:]) * np.sign(wave.mean) for start in starts for wave in motion.waves]
     slowest = min(float(np.min(speed)) for speed in speeds)
     priors = tuple(replace(prior, index=prior.index + 1) for prior in priors)
     fixed = {index + 1: value for index, value in fixed.items()}
@@ -273,8 +272,8 @@ def starts_of(motion: ShaftMotion, straight: FloatArray) -> list[FloatArray]:
     the filters little, but the wave after removal of such a lag is far too large. Only starts whose wave keeps the
     shaft turning are used.
     """
-    apart = _apart(straight, _RIGID)
-    return [theta for theta in (straight, apart) if theta is not None and _keeps_turning(motion, theta[_RIGID:])]
+    apart = _apart(straight, RIGID_COUNT)
+    return [theta for theta in (straight, apart) if theta is not None and _keeps_turning(motion, theta[RIGID_COUNT:])]
 
 
 def _keeps_turning(motion: ShaftMotion, phi: FloatArray) -> bool:

@@ -158,6 +158,9 @@ class RigidShaft:
         return np.array([rough_inertia, rough_inertia * float(np.median(np.abs(s)))])
 
 
+RIGID_COUNT = len(RigidShaft.names)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Drill string: torsional waves between the motor and the inertia at the bottom; two masses are its limit.
 #

@@ -234,10 +234,10 @@ _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0
 exchanged; equal ones, in whose valley the lags cancel."""
 _ROUNDS = 5               # rounds of reweighting
 _NO_LAG = 0.1            # rad at the highest frequency, below which a lag has no effect
-_CLEAR = 20.0            # least power that the speed explains, over that of the residual
-_NARROW = 0.05           # of the frequency: width of the mean; with lines, bins beside a line need not be clear
+CLEAR = 20.0            # least power that the speed explains, over that of the residual
+NARROW = 0.05           # of the frequency: width of the mean; with lines, bins beside a line need not be clear
 _PHASE, _WIDE_PHASE = 1.2, 3.0     # rad; largest phase of the lags in the narrow and in the wide band
-_LEAST_BINS = 8           # fewest frequencies above the noise for the fit
+LEAST_BINS = 8           # fewest frequencies above the noise for the fit
 _ENOUGH_BINS = 40        # clear bins that the phase rule keeps in any case
 _LEAST_LAG_S = 1e-3       # s; a shorter lag counts as this one
 _ABOUT_AS_WELL = 9.0     # of −2 ln L: a smaller difference counts as an equal fit
@@ -267,8 +267,8 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
     limits = box(inertia, 1.0, torque_span_nm, priors)
     every = FitProblem(bins, guessed(bins, inertia).variance, priors, free, limits)
     # bins for the first fit: torque and acceleration above their noise at the highest frequencies
-    moved, _ = smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
-    keep = np.asarray(moved * bins.energy > _CLEAR * every.variance)
+    moved, _ = smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, NARROW)
+    keep = np.asarray(moved * bins.energy > CLEAR * every.variance)
     if np.count_nonzero(keep) < _ENOUGH_BINS:
         keep = np.ones(len(bins), dtype=np.bool_)
     problem = _part(every, keep)
@@ -291,10 +291,10 @@ def _settled(every: FitProblem, keep: BoolArray, fit: Fit, phase: float) -> Foun
         taken[keep] = leverage
         found = evaluate(_levelled(every, fit.theta, _unseen_levels(problem, fit.theta)), bins)
         every = replace(every, variance=from_residuals(bins, found.error, taken).variance)
-        explained, _ = smoothed(bins.hertz, np.abs(found.gain * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
-        stands = explained * bins.energy > _CLEAR * every.variance
+        explained, _ = smoothed(bins.hertz, np.abs(found.gain * bins.speed[:, 0]) ** 2 / bins.energy, NARROW)
+        stands = explained * bins.energy > CLEAR * every.variance
         clear = int(np.count_nonzero(stands))
-        if clear < _LEAST_BINS:
+        if clear < LEAST_BINS:
             return None
         keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands], phase))
         problem = _part(every, keep)

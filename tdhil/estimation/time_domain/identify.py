@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding, ModelWords
+from tdhil.estimation.data_checks import AT_LIMIT, LIMIT_SHARE
 from tdhil.estimation.frequency_domain import (
     LAG_BOUND_S,
     SKEW_BOUND_S,
@@ -37,8 +38,6 @@ from tdhil.recording import FloatArray, Recording
 IntArray = NDArray[np.intp]
 _STEADY_SHARE = 0.05       # of the speed: with less excursion the speed is constant
 _IDLE_SHARE = 0.02         # of the torque's span: a smaller torque counts as none
-_LIMIT_SHARE = 0.005      # largest share of samples at a limit
-_AT_LIMIT = 0.98          # of the torque limit: a torque above it is at the limit
 _FLAT_SHARE = 0.01        # largest share of samples on a plateau
 _LIVELY = 1.5             # quanta; least median step between neighbours, from which noise is visible
 _BESIDE = 20              # samples on either side of a plateau
@@ -72,13 +71,13 @@ def check_signals(recording: Recording, samples: Samples) -> None:
                        entry=MessageCode.NO_EXCITATION)
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
-    if flagged > _LIMIT_SHARE:
+    if flagged > LIMIT_SHARE:
         raise Refused(f"the drive was at an internal limit for {100 * flagged:.1f} % of the record", advice,
                       entry=MessageCode.SIGNAL_CLIPPED)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
-        at_limit = float(np.mean(np.abs(torque + recording.torque_offset_nm) >= _AT_LIMIT * limit))
-        if at_limit > _LIMIT_SHARE:
+        at_limit = float(np.mean(np.abs(torque + recording.torque_offset_nm) >= AT_LIMIT * limit))
+        if at_limit > LIMIT_SHARE:
             raise Refused(f"the torque was at its limit of {limit:g} N·m for {100 * at_limit:.1f} % of the record",
                           advice, entry=MessageCode.SIGNAL_CLIPPED)
     for name, signal, quantum in (("torque", torque, recording.torque_resolution_nm),

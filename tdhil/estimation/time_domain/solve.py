@@ -152,7 +152,7 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
 # model (`sandwich`).
 
 
-_LEAST_DOF = 3.0          # least degrees of freedom for the quantile
+LEAST_DOF = 3.0          # least degrees of freedom for the quantile
 _SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))   # start values of the shapes of both filters
 _EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # κ of two equal poles, and the distance that counts as equal to it
 
@@ -184,7 +184,7 @@ def spread(problem: FitProblem, fit: Fit, scores: FloatArray, index: int, confid
     if factor > 1.0:
         dof = min(dof, blocks.count)
     lean = float(direction_gap(problem, fit.theta) @ direction)
-    return Spread(sd, max(factor, 1.0), student_quantile(confidence, max(dof, _LEAST_DOF)), lean)
+    return Spread(sd, max(factor, 1.0), student_quantile(confidence, max(dof, LEAST_DOF)), lean)
 
 
 def direction_gap(problem: FitProblem, theta: FloatArray) -> FloatArray:

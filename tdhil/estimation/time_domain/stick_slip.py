@@ -13,9 +13,9 @@ import numpy as np
 from profiles import MessageCode
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples
+from tdhil.estimation.time_domain.windows import STILL_QUANTA
 
 _STILL_SHARE = 0.02       # of the highest speed: a lower speed counts as standstill
-_STILL_QUANTA = 3.0       # resolution steps of the reported speed: a lower speed also counts as standstill
 _MOVES_SHARE = 0.2        # of the highest speed: least speed of a jump
 _LEAST_SAMPLES = 12       # fewest samples of a standstill
 _SETTLED = 0.2            # of a standstill: its beginning, in which the reports still show the motion before
@@ -57,7 +57,7 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
         return None
     speed, torque = samples.speed_rad_s, samples.torque_nm
     fastest = float(np.max(np.abs(speed)))
-    still = np.abs(speed) <= max(_STILL_SHARE * fastest, _STILL_QUANTA * speed_quantum)
+    still = np.abs(speed) <= max(_STILL_SHARE * fastest, STILL_QUANTA * speed_quantum)
     span = float(np.ptp(torque))
     edges = np.concatenate([[0], np.flatnonzero(np.diff(still)) + 1, [len(still)]])
     parts = [(int(first), int(last)) for first, last in pairwise(edges)]

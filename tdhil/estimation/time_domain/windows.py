@@ -34,7 +34,7 @@ from tdhil.recording import BoolArray, FloatArray
 _MOST_SAMPLES = 200_000   # most samples of a recording that are used: more are averaged in groups
 _LEAST_RATE_HZ = 50.0     # Hz; least rate after this averaging
 _STILL_SHARE = 0.04       # of the highest speed: below it the shaft may be at standstill
-_STILL_QUANTA = 3.0       # quanta of the speed below which the shaft stands still
+STILL_QUANTA = 3.0       # quanta of the speed below which the shaft stands still
 _GAP_STEPS = 4.5          # missing samples in a row that a straight line bridges
 _GAP_S = 0.05             # s; a shorter interval is no gap
 _LEAST_SAMPLES_OF_STRETCH = 32   # fewer samples make no stretch
@@ -77,7 +77,7 @@ def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[OneWa
     if len(samples) < _LEAST_SAMPLES_OF_STRETCH:
         return ()
     time, speed = samples.time_s, samples.speed_rad_s
-    still = max(_STILL_SHARE * float(np.max(np.abs(speed))), _STILL_QUANTA * speed_quantum)
+    still = max(_STILL_SHARE * float(np.max(np.abs(speed))), STILL_QUANTA * speed_quantum)
     moving = np.abs(speed) > still
     ends = time[np.flatnonzero(moving[:-1] & ~moving[1:]) + 1]
     if len(ends):      # samples shortly before the end of reported motion

@@ -5,7 +5,6 @@ A unit is taken from ``--columns``, else from a row of units below the header, e
 """
 
 import difflib
-import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, sp
 
 QUANTITIES = ("time", "speed", "torque")
 SI = {"time": "s", "speed": "rad/s", "torque": "N·m"}
-_TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class ColumnUnit:
     of_rated: bool = False
 
 
-_TURNS = ColumnUnit("speed", "1/s", _TURN)
+_TURNS = ColumnUnit("speed", "1/s", quantities.TURNS_S.times)
 _PERCENT = ColumnUnit("torque", "%", 1e-2, of_rated=True)
 _PERMILLE = ColumnUnit("torque", "‰", 1e-3, of_rated=True)
 
@@ -51,7 +49,6 @@ _ALSO = {
     },
 }
 _BRACKETED = re.compile(r"^(.*?)\s*[\[(<]\s*([^\[\]()<>]*?)\s*[\])>]$")
-_IGNORED = re.compile(r"[\s·.*⋅_^⁻-]")
 
 
 def unit_of(quantity: str, text: str) -> ColumnUnit | None:
@@ -59,7 +56,7 @@ def unit_of(quantity: str, text: str) -> ColumnUnit | None:
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
     # case distinguishes mN·m from MN·m; it does not matter for a time, because no tool samples in megaseconds
-    word = _IGNORED.sub("", inner.replace("¹", "1").casefold())
+    word = quantities.SIGNS_IGNORED.sub("", inner.replace("¹", "1").casefold())
     if (also := _ALSO[quantity].get(word)) is not None:
         return also
     known = quantities.unit_of(inner if quantity != "time" else inner.casefold())
@@ -197,7 +194,7 @@ def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, 
 HEADER_LINES = 50
 _STANDARD = {"time": "time_s", "speed": "speed_rad_s", "torque": "torque_nm"}
 MOST_COLUMNS = 512
-_DELIMITERS = ("\t", ";", ",")
+DELIMITERS = ("\t", ";", ",")
 
 
 @dataclass(frozen=True)
@@ -218,7 +215,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     usual = ",".join(_STANDARD[choice.quantity] for choice in choices)
     sensor = _flag(choices) == REFERENCE_FLAG
     for number, line in enumerate(lines[:HEADER_LINES], 1):
-        for delimiter in _DELIMITERS:
+        for delimiter in DELIMITERS:
             if delimiter not in line:
                 continue
             names = split_cells(line, delimiter)

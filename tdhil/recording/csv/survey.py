@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tdhil.errors import CsvUnusable, UsageError, shown
 from tdhil.recording.csv.layout import (
+    DELIMITERS,
     HEADER_LINES,
     MOST_COLUMNS,
     QUANTITIES,
@@ -29,7 +30,6 @@ from tdhil.recording.csv.layout import (
 )
 from tdhil.recording.csv.text import blocks, decimal_sign, encoding_of, is_missing, looks_numeric, number, split_cells
 
-_DELIMITERS = ("\t", ";", ",")
 _BELOW = 6          # lines below the header in which the first row of numbers is looked for
 ROWS = 8
 """Rows of numbers that a survey shows."""
@@ -111,7 +111,7 @@ def _header(lines: Sequence[str], file: str) -> tuple[Header, int]:
     """
     best: tuple[int, Header, int] | None = None
     for number_, line in enumerate(lines[:HEADER_LINES], 1):
-        for delimiter in _DELIMITERS:
+        for delimiter in DELIMITERS:
             names = split_cells(line, delimiter)
             words = sum(bool(name) and not _is_value(name) for name in names)
             if words < 2 or len(names) > MOST_COLUMNS or (best is not None and words <= best[0]):

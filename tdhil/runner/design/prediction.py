@@ -18,6 +18,7 @@ import numpy as np
 
 from tdhil.estimation import Levels, Samples, SpectralLine, Stretch, period_lines, tie_viscous
 from tdhil.estimation.frequency_domain import (
+    LEAST_NU,
     SPEED_LAG,
     TORQUE_LAG,
     Model,
@@ -136,7 +137,6 @@ def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noi
 # ---------------------------------------------------------------------------------------------------------------------
 
 _NINE_IN_TEN = 1.28       # standard deviations: one-sided 90 % quantile of the normal distribution
-LEAST_NU = 2.0            # complex degrees of freedom of a line's weight, below which identification omits the line
 
 
 @dataclass(frozen=True)

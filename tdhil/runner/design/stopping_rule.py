@@ -48,9 +48,9 @@ from tdhil.estimation import (
     tie_viscous,
     usable_samples,
 )
+from tdhil.estimation.frequency_domain import LEAST_NU
 from tdhil.recording import FloatArray, Recording
 from tdhil.runner.design.prediction import (
-    LEAST_NU,
     Evidence,
     FittedRigid,
     fit,

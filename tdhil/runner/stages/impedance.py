@@ -22,6 +22,7 @@ from profiles import MessageCode
 from tdhil.recording import Excitation, Segment
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import (
+    LEAST_COUNTED,
     MotionLimits,
     PeriodicReference,
     Plan,
@@ -48,7 +49,6 @@ LARGEST_SHARE = 0.4
 PILOT_SHARE, PILOT_PERIODS = 0.05, 2   # offset of the pilot as a share of the torque limit; its periods
 ROOM_SHARE = 0.9           # share of the room in speed and torque that a plan uses
 FADE_S = 2.0               # s; fade-out at the end
-LEAST_COUNTED = 6         # periods that must follow the settling ones
 RESERVE_S = 10.0           # s; reserved of the time limit, beside stage 5
 DITHER_COUNTS, DITHER_TURNS = 3.0, 6.0 * 1.0103
 """A small sine on the reference: amplitude in counts of the reported speed, and cycles per period (no whole number, far

@@ -38,7 +38,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.studies.coverage.plants import ComplexArray, CoveragePlant, FloatArray, ReportFilter
+from tdhil.recording import FloatArray
+from tdhil.studies.coverage.plants import ComplexArray, CoveragePlant, ReportFilter
 from tdhil.studies.coverage.simulate import quiet_shaft
 
 _FOLDS = 30              # multiples of the sampling rate whose aliases are included, on either side

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from profiles.quantities import RAD_S_PER_RPM
+from tdhil.recording import FloatArray
+
 ComplexArray = NDArray[np.complex128]
 
 
@@ -140,8 +142,8 @@ class CoveragePlant:
 # notes, scaled to the torque and speed of the others.
 
 
-RPM = 0.10471975511965977   # rad/s
 
+RPM = RAD_S_PER_RPM
 FIELD_NOISE = PlantNoise(3.0, 0.5, 10.0, 0.02, 0.003, 2.0, 0.1 * RPM, 1.0)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from tdhil.errors import MessageCode, TdhilError
 from tdhil.estimation import Options, identify
 from tdhil.process_pool import Loss, Pool, TaskLimits
-from tdhil.recording import Excitation, Recording, Segment
+from tdhil.recording import Excitation, FloatArray, Recording, Segment
 from tdhil.runner.excitation import MotionLimits, Plan, PlanRequest, RigGuess, make_plan
-from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, ReportFilter
+from tdhil.studies.coverage.plants import CoveragePlant, ReportFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Motion of the shaft: a plan of stage 5 per run, each from its own rough inertia, on one time grid.

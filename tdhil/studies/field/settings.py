@@ -6,9 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from profiles import DataModel
+from profiles import DataModel, Positive
 
-Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Tones = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=24)]
 Gains = Annotated[tuple[Positive, ...], Field(min_length=3, max_length=24)]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import model_validator
 
-from profiles import refuse_if
+from profiles import Positive, refuse_if
 from tdhil.studies.paper.design_runs import DesignResult, OverDesign
-from tdhil.studies.paper.loop import LABELS, LoopRecord, LoopSettings, Positive, SamplePeriod, changed, simulate
+from tdhil.studies.paper.loop import LABELS, LoopRecord, LoopSettings, SamplePeriod, changed, simulate
 from tdhil.studies.paper.orthogonal_design import DesignSettings
 from tdhil.studies.paper.processing import response, torque_line
 from tdhil.studies.paper.published import PublishedDesign, published

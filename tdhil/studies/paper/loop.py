@@ -25,11 +25,11 @@ from math import pi
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from profiles import DataModel, Finding, refuse_if
+from profiles import DataModel, Finding, NonNegative, Positive, refuse_if
 from sim_bus.plant import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_torque
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of one run of the paper's closed loop, and their names for factors and `--set`.
@@ -39,8 +39,6 @@ from sim_bus.plant import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_
 # published figures, but not confirmed by them.
 
 
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
 SamplePeriod = Annotated[float, Field(gt=0.0, le=0.1)]
 
 MAX_SAMPLES = 2_000_000
@@ -133,7 +131,6 @@ def changed(settings: LoopSettings, **values: object) -> LoopSettings:
 # References of the loop, in rad/s: sine with offset (equation 8), step (equation 9), chirp, multisine.
 
 
-FloatArray = NDArray[np.float64]
 
 
 class Reference(Protocol):

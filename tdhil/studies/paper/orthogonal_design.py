@@ -10,10 +10,10 @@ from importlib.resources import files
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError, model_validator
 
 from profiles import DataModel, Finding, parse_model, refuse_if
+from tdhil.recording import FloatArray
 from tdhil.studies.paper.loop import FACTORS, SYMBOLS, LoopSettings, changed, full_name
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -92,7 +92,6 @@ def _times(count: int) -> str:
 # additive, level means differ only by that factor. R = largest level mean less smallest.
 
 
-FloatArray = NDArray[np.float64]
 RangeRows = Sequence[Sequence[int]]
 
 

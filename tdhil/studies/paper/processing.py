@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tdhil.estimation import LineFit, line_fit
-
-FloatArray = NDArray[np.float64]
+from tdhil.recording import FloatArray
 
 
 def backward_difference(time_s: FloatArray, speed_rad_s: FloatArray) -> FloatArray:

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from profiles import refuse_if
-from tdhil.studies.paper.loop import LABELS, LoopSettings, Positive, SamplePeriod, changed, simulate
+from profiles import Positive, refuse_if
+from tdhil.recording import FloatArray
+from tdhil.studies.paper.loop import LABELS, LoopSettings, SamplePeriod, changed, simulate
 from tdhil.studies.paper.processing import Response, response, settled_periods
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 # Plot of a sweep, as in figures 9, 10, 12 and 13: waveforms, amplitude difference, gain and phase.
 
 
-FloatArray = NDArray[np.float64]
 
 _SHOWN_PERIODS = 2.0
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
+from profiles import NonNegative, Positive
 from tdhil.studies.paper.design_runs import DesignResult, DesignRun, OverDesign
-from tdhil.studies.paper.loop import LABELS, NonNegative, Positive, SamplePeriod
+from tdhil.studies.paper.loop import LABELS, SamplePeriod
 from tdhil.studies.paper.orthogonal_design import DesignSettings, Factor, Rows, ranking
 from tdhil.studies.paper.published import PublishedDesign, published
 from tdhil.studies.paper.table_statements import design_statements, tdhil_inertia
