@@ -67,6 +67,9 @@ def acquire_steps(run: Run, case: StepCase, program: StepProgram, turning: Turni
             steps.run_pair(number)
             keep(program)
         found = _found_so_far(run, case, program, steps.starts_s)
+        if isinstance(found, str):
+            run.log.event(loop.now_s, "plan", f"the steps so far could not be compared, no more follow: {found}")
+            return
         more = further_pairs(found, program, loop.guard.left_s(loop.now_s) - STEPS_RESERVE_S)
         if more:
             text = f"{found.reason}. {more} more pairs follow, {2.0 * program.half_s * (more + 1):.0f} s"
@@ -79,11 +82,19 @@ def acquire_steps(run: Run, case: StepCase, program: StepProgram, turning: Turni
             keep(longer)
 
 
-def _found_so_far(run: Run, case: StepCase, program: StepProgram, starts_s: list[float]) -> StepVerification:
-    """Compare the steps so far, while the shaft turns at the lower speed."""
+def _found_so_far(run: Run, case: StepCase, program: StepProgram, starts_s: list[float]) -> StepVerification | str:
+    """Compare the steps so far, while the shaft turns at the lower speed. Return a text if that is not possible."""
     recording = run.log.recording(complete=True)
     record = StepRecord(
         recording.time_s, recording.speed_rad_s, recording.fresh, recording.limited, tuple(starts_s),
         run.loop.period_s, recording.timing_half_width_s, run.task.request.reference_filter_s)
     command = Command(Mode.SPEED, program.low_rad_s, 0.0)
-    return run.loop.compute(partial(verify_record, case, program, record), command)
+    return run.loop.compute(partial(_compared, case, program, record), command)
+
+
+def _compared(case: StepCase, program: StepProgram, record: StepRecord) -> StepVerification | str:
+    """Return the comparison, or its error as text: the steps are recorded, so no error of it ends the run."""
+    try:
+        return verify_record(case, program, record)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"

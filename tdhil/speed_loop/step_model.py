@@ -206,11 +206,13 @@ class StepModel:
         size, length = len(a), self.count + self._apart
         whole = np.zeros((size + 1, size + 1))
         whole[:-1, :-1], whole[:-1, -1] = a, b
-        first = max(0, ceil(delay_s / self.period_s - 1e-9))
+        first = min(length, max(0, ceil(delay_s / self.period_s - 1e-9)))     # a fit may try any delay
         state = np.zeros(size + 1)
         state[-1] = 1.0
-        state = expm(whole * (first * self.period_s - delay_s)) @ state
-        out = np.r_[np.zeros(first), _outputs(expm(whole * self.period_s), np.append(c, 0.0), state, length - first)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            state = expm(whole * (first * self.period_s - delay_s)) @ state
+            out = np.r_[np.zeros(first), _outputs(expm(whole * self.period_s), np.append(c, 0.0), state,
+                                                  length - first)]
         response = out[:self.count] + 1.0 - out[self._apart:]
         return np.asarray(response + self._rounding(response, self.rounding_amplitude(theta)), dtype=np.float64)
 
@@ -242,14 +244,13 @@ def _outputs(move: Reals, c: Reals, state: Reals, length: int) -> Reals:
     """
     block = max(1, round(sqrt(length)))
     rows, states = [c], [state]
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(1, block):
-            rows.append(rows[-1] @ move)
-        far = np.linalg.matrix_power(move, block)
-        for _ in range(1, ceil(length / block)):
-            states.append(far @ states[-1])
-        out: Reals = np.asarray((np.array(states) @ np.array(rows).T).ravel()[:length], dtype=np.float64)
-        beyond = np.flatnonzero(~(np.abs(out) < _UNSTABLE))
+    for _ in range(1, block):
+        rows.append(rows[-1] @ move)
+    far = np.linalg.matrix_power(move, block)
+    for _ in range(1, ceil(length / block)):
+        states.append(far @ states[-1])
+    out: Reals = np.asarray((np.array(states) @ np.array(rows).T).ravel()[:length], dtype=np.float64)
+    beyond = np.flatnonzero(~(np.abs(out) < _UNSTABLE))
     if beyond.size:
         out[beyond[0]:] = _UNSTABLE
     return out

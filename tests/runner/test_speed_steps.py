@@ -80,6 +80,21 @@ def test_further_pairs_are_run_and_logged_after_one_that_does_not_count(world, m
     assert any("more pairs follow" in text for _, text in log.events)
 
 
+def test_an_error_of_the_comparison_does_not_end_the_run(world, monkeypatch):
+    def fails(*_):
+        raise ValueError("math domain error")
+
+    monkeypatch.setattr("tdhil.runner.speed_steps_program.verify_record", fails)
+    here, log = world(FakeDrive(), LIMITS), BuilderLog()
+    result = runner(here, log=log).run()
+    assert result.cause is None
+    assert_at_rest(here, result)
+    said = log.run["verification"]
+    assert len(said["starts_s"]) == 2 * (said["program"]["pairs"] + 1)
+    assert any("could not be compared, no more follow: ValueError: math domain error" in text
+               for _, text in log.events)
+
+
 @pytest.mark.parametrize(("limits", "said"), [
     (replace(LIMITS, load="string", torque_ramp_nm_s=50.0), "load is string"),
     (replace(LIMITS, time_s=130.0), "the time limit leaves 10 s"),

@@ -146,6 +146,16 @@ def test_a_response_of_no_gains_at_all_is_named():
     assert result.outcome is StepOutcome.DIFFERS and "a ramp, a filter or another resonance" in result.reason
 
 
+def test_a_response_that_a_fit_explains_by_a_delay_beyond_its_end_is_judged():
+    count = round(PROGRAM.half_s / PERIOD_S) - 1
+    grown = np.sin(np.arange(count)) * np.exp(0.02 * np.arange(count))
+    assert found(np.tile(grown, (PROGRAM.pairs, 1))).outcome is StepOutcome.DIFFERS
+    late = np.zeros(11)
+    late[6] = 1e4
+    model = verification.StepModel(CASE, PROGRAM, PERIOD_S, count, 0.0, 0.0)
+    assert model.reported(late) == pytest.approx(np.ones(count))
+
+
 def test_a_limit_that_acted_or_too_few_pairs_tell_nothing():
     pairs = responses(CASE.gains)
     assert found(pairs, limited=True).outcome is StepOutcome.CANNOT_TELL
