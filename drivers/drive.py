@@ -139,6 +139,7 @@ class DriveLimits:
     temperature_c: float | None = None     # °C; limit of a reported temperature
     torque_offset: bool = False            # `Command.torque_offset_nm` is used; refused without one
     string: bool = False                   # a drill string is attached; trapped torque is refused
+    noise_scale_rad_s: float = 0.0         # its shares count as noise at standstill, if it is above ``speed_rad_s``
 
 
 @dataclass(frozen=True)

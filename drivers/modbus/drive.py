@@ -231,7 +231,8 @@ class ModbusDrive:
             self._watchdog_s, self._quick_stop_rad_s2 = limits.watchdog_s, limits.quick_stop_rad_s2
             self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
         scales = self._codec.scales
-        self._standstill = ZeroSpeed(scales.speed, limits.speed_rad_s, self.period_s)
+        scale_rad_s = max(limits.speed_rad_s, limits.noise_scale_rad_s)
+        self._standstill = ZeroSpeed(scales.speed, scale_rad_s, self.period_s)
         self._ticks = Ticks(self.clock, self.period_s, BUDGET_SHARE * self._watchdog_s)
         self._late_before = late_replies(self._link)
         target = profile.cycle.torque_setpoint

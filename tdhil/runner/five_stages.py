@@ -199,6 +199,7 @@ class Runner:
                 string=limits.has_drill_string,
                 torque_offset=task.request.impedance == "offset"
                 or (task.case is not None and task.case.torque_offset),
+                noise_scale_rad_s=limits.noise_scale_rad_s,
             )
         )
         taken = preconditions.scales_taken_as_true(found, calibrated=task.calibrated)

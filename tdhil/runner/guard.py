@@ -116,7 +116,7 @@ class Guard:
         self._smallest_share = assumptions.smallest_inertia_share
         # Noise and quantisation near zero do not count as reverse rotation.
         self._speed_noise_rad_s = 5.0 * speed_resolution_rad_s
-        self._reverse_rad_s = max(self._speed_noise_rad_s, 0.02 * limits.speed_max_rad_s)
+        self._reverse_rad_s = max(self._speed_noise_rad_s, 0.02 * limits.noise_scale_rad_s)
         # The reported torque is noisy and may overshoot. The commanded torque is checked exactly.
         self._torque_seen_nm = 1.25 * limits.torque_nm + 10.0 * torque_resolution_nm
         # Half of the drive's watchdog time, but at least three lost frames.

@@ -9,6 +9,10 @@ from tdhil.errors import Interrupted
 MEAN_SPEED_SHARES = 0.25, 0.7
 """Two mean speeds of the operating points of stage 2, as shares of the speed window."""
 
+NOISE_SPEEDS = 5.0
+"""Largest `MachineLimits.noise_scale_rad_s`, as a multiple of the highest speed of the run. At this value, standstill is
+2.5 % of that speed, and reverse rotation begins at 10 %."""
+
 
 @dataclass(frozen=True)
 class MachineLimits:
@@ -32,6 +36,15 @@ class MachineLimits:
     accept_shared_watchdog: bool = False   # the operator accepts that any client feeds it (--accept-shared-watchdog)
     accept_speed_unit: bool = False    # the operator accepts the unit of speed unchecked (--accept-speed-unit)
     accept_wider: frozenset[str] = frozenset()     # own limits of the drive that the operator lets the run widen
+    rig_speed_max_rad_s: float = 0.0   # limits.speed_max_rad_s, if this run has a lower one (--highest-speed); else 0
+
+    @property
+    def noise_scale_rad_s(self) -> float:
+        """Return the speed whose shares count as noise of the reported speed, at standstill and in reverse.
+
+        A lower highest speed of one run makes no report quieter.
+        """
+        return max(self.speed_max_rad_s, min(self.rig_speed_max_rad_s, NOISE_SPEEDS * self.speed_max_rad_s))
 
     @property
     def has_drill_string(self) -> bool:

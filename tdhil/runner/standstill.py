@@ -36,7 +36,7 @@ one of 3 times in 1 %: a count of any size is noise if the position shows stands
 
 def standstill_speed(limits: MachineLimits, speed_resolution_rad_s: float) -> float:
     """Return the highest reported speed that counts as standstill, rad/s."""
-    return max(3.0 * speed_resolution_rad_s, min(AT_REST_SHARE * limits.speed_max_rad_s, STANDSTILL_RAD_S))
+    return max(3.0 * speed_resolution_rad_s, min(AT_REST_SHARE * limits.noise_scale_rad_s, STANDSTILL_RAD_S))
 
 
 class CountsOfNoise:

@@ -259,7 +259,8 @@ class RunSession:
     def _task(self, identity: Identity) -> Task:
         request, log = self._request, self.log
         profile, overrides, accepted = request.connection.profile, request.overrides, request.options.accept_unverified
-        bench = bench_of(identity.simulated, request.rig, request.options.highest_speed_rad_s)
+        highest_rad_s = request.options.highest_speed_rad_s
+        bench = bench_of(identity.simulated, request.rig, highest_rad_s)
         log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
         refuse_another_drive(log.run, asdict(identity))
         if not identity.simulated:
@@ -267,8 +268,10 @@ class RunSession:
             log.configure(unverified=list(accepted_lines(profile, accepted)))
         elif text := note(profile):
             self._operator_interface.say(text)
+        rig_limits = None if highest_rad_s is None else bench_of(identity.simulated, request.rig).limits
         limits = machine_limits(
             bench,
+            rig_speed_max_rad_s=0.0 if rig_limits is None else rig_limits.speed_max_rad_s,
             accept_no_watchdog=overrides.no_watchdog,
             accept_shared_watchdog=overrides.shared_watchdog,
             accept_wider=overrides.wider_limits,

@@ -85,10 +85,11 @@ def bench_of(simulated: bool, rig: Rig | None, highest_speed_rad_s: float | None
 
 def machine_limits(
     bench: Rig, *, accept_no_watchdog: bool = False, accept_shared_watchdog: bool = False,
-    accept_wider: Collection[str] = (), accept_speed_unit: bool = False,
+    accept_wider: Collection[str] = (), accept_speed_unit: bool = False, rig_speed_max_rad_s: float = 0.0,
 ) -> MachineLimits:
     """Return the guard's limits. Raises PreflightRefused if the rig has none.
 
+    ``rig_speed_max_rad_s``: the rig's own highest speed, if ``bench`` has a lower one for this run.
     The overrides belong to one run and its command line. No file of the bench can set them.
     """
     limits = require_limits(bench)
@@ -112,6 +113,7 @@ def machine_limits(
         accept_shared_watchdog=accept_shared_watchdog,
         accept_wider=frozenset(accept_wider),
         accept_speed_unit=accept_speed_unit,
+        rig_speed_max_rad_s=rig_speed_max_rad_s,
     )
 
 

@@ -107,6 +107,15 @@ def test_every_limit_trips(limits, seen, what):
     assert caught.value.next_step
 
 
+def test_a_lower_highest_speed_of_one_run_does_not_turn_noise_into_reverse_rotation():
+    careful = replace(LIMITS, speed_max_rad_s=2.0)
+    for limits, noise_rad_s in ((careful, 0.04), (replace(careful, rig_speed_max_rad_s=10.0), 0.19),
+                                (replace(careful, rig_speed_max_rad_s=1000.0), 0.19)):
+        guard(limits).check_sample(REST, sample(-noise_rad_s))
+        with pytest.raises(LimitHit, match="turns backwards"):
+            guard(limits).check_sample(REST, sample(-noise_rad_s - 0.02))
+
+
 def test_the_time_limit_counts_from_the_first_motion():
     watch = guard()
     watch.check_sample(REST, sample(time_s=5000.0))

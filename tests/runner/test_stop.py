@@ -1,11 +1,15 @@
 """The stop sequence: its order, and that a turning shaft is never disabled."""
 
+import random
+from dataclasses import replace
+
 import pytest
 
 from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommunicationLost, StopNotConfirmed
 from tdhil.errors import ExitCode, exit_code
 from tdhil.runner.stop import StopReport, not_confirmed
+from tests.rigs import LIMITS
 from tests.runner.fake_drive import FakeDrive
 from tests.runner.stop_calls import LAG_S, asked
 
@@ -36,6 +40,18 @@ def test_the_reported_speed_must_be_zero_for_longer_than_the_largest_lag(world, 
     report = here.stop_sequence().run()
     assert report.at_rest_s - start_s >= 3.0 * LAG_S
     assert here.drive.disabled_at == [0.0]
+
+
+@pytest.mark.parametrize(("rig_rad_s", "confirmed"), [(10.0, True), (0.0, False)])
+def test_a_lower_highest_speed_of_one_run_makes_no_report_quieter(world, rig_rad_s, confirmed):
+    """Noise of 0.025 rad/s is half of the standstill speed of this rig, 0.05 rad/s, and not of a rig for 2 rad/s."""
+    rng = random.Random(1)
+    noisy = FakeDrive(misbehave=lambda _, one: one._replace(speed_rad_s=one.speed_rad_s + rng.gauss(0.0, 0.025)))
+    here = world(noisy, replace(LIMITS, speed_max_rad_s=2.0, rig_speed_max_rad_s=rig_rad_s))
+    here.turn(1.2)
+    report = here.stop_sequence().run()
+    assert report.confirmed is confirmed
+    assert noisy.speed == 0.0
 
 
 @pytest.mark.parametrize("what", ["status", "speed"])

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from drivers import PreflightRefused
 from tdhil.cli.main import main
 from tdhil.config import simulated_default_rig
 from tdhil.errors import ExitCode, UsageError
@@ -25,6 +26,21 @@ def test_a_run_may_have_a_lower_highest_speed_and_nothing_else_changes(simulated
 def test_no_run_exceeds_the_limits_of_the_rig(speed_rad_s):
     with pytest.raises(UsageError, match=r"--highest-speed: .* is not within the limits of the rig, 0.5 to 10 rad/s"):
         bench_of(False, simulated_default_rig(None), speed_rad_s)
+
+
+@pytest.mark.parametrize(("given", "rig_rad_s"), [(("--highest-speed", "2"), 10.0), ((), 0.0)])
+def test_the_noise_of_a_run_with_a_lower_highest_speed_is_that_of_its_rig(given, rig_rad_s, monkeypatch, tmp_path):
+    found = []
+
+    def limits_of(*bench, **said):
+        found.append(machine_limits(*bench, **said))
+        raise PreflightRefused("enough is seen")
+
+    monkeypatch.setattr("tdhil.session.run_session.machine_limits", limits_of)
+    log = str(tmp_path / "run.mcap")
+    assert main(["identify", "--simulate", *given, "--log", log]) == ExitCode.REFUSED
+    assert found[0].rig_speed_max_rad_s == rig_rad_s
+    assert found[0].noise_scale_rad_s == 10.0
 
 
 def test_the_plan_stays_below_the_highest_speed_of_the_run(capsys):
