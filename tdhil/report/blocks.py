@@ -169,7 +169,8 @@ def report_of_run(
         subtitle=" · ".join(fact for fact in facts if fact),
         simulated=banner(document),
         answer=answer,
-        warnings=() if document["complete"] else ("The run was cut short. The report shows the data recorded before.",),
+        warnings=(*coded_warnings(document), *(() if document["complete"] else (
+            "The run was cut short. The report shows the data recorded before.",))),
         sections=tuple(sections),
         footer=_footer(document, sha256),
         reference=reference_of(document),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -114,9 +114,13 @@ def speed_loop_present_of(run: Mapping[str, Any]) -> dict[str, Any] | None:
     return numbers | {"settings": settings} if settings else None
 
 
-def run_facts(recording: Recording, run: Mapping[str, Any], log: str) -> dict[str, Any]:
+def run_facts(
+    recording: Recording, run: Mapping[str, Any], log: str, warnings: Sequence[str] = ()
+) -> dict[str, Any]:
     """Return what the document of a run with a virtual string or with steps states of the run itself."""
     return {
+        "warnings": list(warnings),
+        "warning_codes": _codes(warnings),
         "gear_ratio": recording.gear_ratio,
         "simulated": recording.simulated,
         "rehearsed_faults": rehearsed_faults(run),
@@ -191,7 +195,7 @@ def result_document(
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,
         "warnings": list(found.warnings),
-        "warning_codes": [entry_of(one, MessageCode.RESULT_WARNING).code for one in found.warnings],
+        "warning_codes": _codes(found.warnings),
         "simulated": recording.simulated,
         "rehearsed_faults": rehearsed_faults(run),
         "rehearsal": rehearsal_of(run),
@@ -246,10 +250,14 @@ def coded_reason(reason: str, document: Mapping[str, Any]) -> str:
     return with_code(reason, "" if code == MessageCode.VALID.code else code)
 
 
+def _codes(warnings: Sequence[str]) -> list[str]:
+    return [entry_of(one, MessageCode.RESULT_WARNING).code for one in warnings]
+
+
 def coded_warnings(document: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the warnings of a result for display, with their codes; a document from before 0.3 has no codes."""
+    """Return the warnings of a result for display, with their codes; an older document may have none of both."""
     codes = [str(code) for code in document.get("warning_codes", ())]
-    warnings = [str(one) for one in document["warnings"]]
+    warnings = [str(one) for one in document.get("warnings", ())]
     return tuple(map(with_code, warnings, codes + [""] * (len(warnings) - len(codes))))
 
 

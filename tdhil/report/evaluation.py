@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from tdhil.report.blocks import (
     shown_date,
 )
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import marks, rehearsal_rows, run_facts
+from tdhil.report.document import coded_warnings, marks, rehearsal_rows, run_facts
 from tdhil.report.figure_words import meanings_section, print_meanings
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
@@ -43,7 +43,8 @@ _CRITICAL_ONLY = "critical speed as predicted; the damping is not compared"
 
 
 def evaluation_document(
-    found: Evaluation, case: EvaluationCase, recording: Recording, run: Mapping[str, Any], log: str
+    found: Evaluation, case: EvaluationCase, recording: Recording, run: Mapping[str, Any], log: str,
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return plain data for `json.dumps`; speeds and torques at the main shaft of the represented machine."""
     prediction, bit = case.prediction, case.string.bit
@@ -76,7 +77,7 @@ def evaluation_document(
         "string": case.string.name,
         "bit": None if bit is None else
         f"{bit.describe()}, viscous {case.string.bottom_viscous_nm_s_rad:g} N·m·s/rad",
-        **run_facts(recording, run, log),
+        **run_facts(recording, run, log, warnings),
     }
 
 
@@ -90,7 +91,8 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
     head = ("verdict", Words(_CRITICAL_ONLY, style="bold yellow") if _critical_only(document) else
             Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
     rows = tuple(_rows(document))
-    console.print(names_and_texts((head, *rows)))
+    warned = (("warning", Words(one, style="yellow")) for one in coded_warnings(document))
+    console.print(names_and_texts((head, *warned, *rows)))
     console.print()
     names = ("tune", "in brackets", document["controller"]["kind"], head[0], *(name for name, _ in rows))
     print_meanings(names, console)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from tdhil.report.blocks import (
     shown_date,
 )
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import marks, only_finite, rehearsal_rows, run_facts
+from tdhil.report.document import coded_warnings, marks, only_finite, rehearsal_rows, run_facts
 from tdhil.report.html import log_hash, write_blocks
 from tdhil.report.intervals import table_cell
 from tdhil.report.letterhead import NO_LETTERHEAD, Letterhead
@@ -59,7 +59,8 @@ _NAMES = {
 
 
 def verification_document(
-    found: StepVerification, case: StepCase, program: StepProgram, recording: Recording, run: Part, log: str
+    found: StepVerification, case: StepCase, program: StepProgram, recording: Recording, run: Part, log: str,
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Plain data for `json.dumps`, at the motor shaft; null in place of an infinite value."""
     document = {
@@ -74,7 +75,7 @@ def verification_document(
         "steps": asdict(program) | {"step_rad_s": program.step_rad_s, "counted_pairs": found.pairs},
         "misfit": {"rms_share": found.misfit_rms, "p": found.misfit_p},
         "response": {name: getattr(found, name).tolist() for name in ("time_s", "reported", "fitted", "predicted")},
-        **run_facts(recording, run, log),
+        **run_facts(recording, run, log, warnings),
     }
     cleaned = only_finite(document)
     assert isinstance(cleaned, dict)
@@ -87,7 +88,8 @@ def print_verification(document: Part, console: PlainConsole) -> None:
     console.print(Words(f"speed loop of the drive, verified by steps{simulated}", style="bold"))
     verdict = document["verdict"]
     head = ("verdict", Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
-    console.print(names_and_texts((head, *_rows(document))))
+    warned = (("warning", Words(one, style="yellow")) for one in coded_warnings(document))
+    console.print(names_and_texts((head, *warned, *_rows(document))))
     if document["rows"]:
         console.print()
         grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))

@@ -10,8 +10,8 @@ MEAN_SPEED_SHARES = 0.25, 0.7
 """Two mean speeds of the operating points of stage 2, as shares of the speed window."""
 
 NOISE_SPEEDS = 5.0
-"""Largest `MachineLimits.noise_scale_rad_s`, as a multiple of the highest speed of the run. At this value, standstill is
-2.5 % of that speed, and reverse rotation begins at 10 %."""
+"""Largest `MachineLimits.noise_scale_rad_s`, as a multiple of the highest speed of the run. Standstill is then 2.5 % of
+that speed, and reverse rotation begins at 10 %."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.estimation import Identification, Options, Verdict
 from tdhil.recording import FloatArray, Recording
 from tdhil.session.rehearsal import code_with
+from tdhil.session.run_warnings import run_warnings
 from tdhil.session.stored_calibration import apply_calibration
 
 if TYPE_CHECKING:
@@ -110,7 +111,6 @@ def conclude(
     """
     from tdhil.estimation import identify
     from tdhil.report import result_document
-    from tdhil.runner import precondition_warnings, speed_warnings, stage_warnings
 
     options = _options(run, log)
     working = working_confidence_of(run, options.confidence)
@@ -118,15 +118,10 @@ def conclude(
     recording = applied.recording
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     identification = _dated(identification, applied.day)
-    # A run whose stop was not confirmed has no result of its own; its replay has one.
-    stop = run.get("stop")
-    unseen = isinstance(stop, Mapping) and stop.get("confirmed") is False
-    stop_said = "the stop of this run was NOT confirmed: standstill was not observed at its end"
     said = (
         *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),
         *(CodedText(one, MessageCode.CALIBRATION_WARNING) for one in applied.warnings),
-        *([CodedText(stop_said, MessageCode.STOP_WAS_NOT_CONFIRMED)] if unseen else ()),
-        *precondition_warnings(run), *speed_warnings(run), *stage_warnings(run),
+        *run_warnings(run),
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.session.rehearsal import code_with
+from tdhil.session.run_warnings import run_warnings
 
 if TYPE_CHECKING:
     from tdhil.recording import FloatArray, Recording
@@ -147,6 +148,6 @@ def conclude_evaluation(
         raise LogError(f"contains no readable evaluation ({error})", where=log,
                        next_step="Repeat the run") from None
     stands = found.outcome in (EvaluationOutcome.AS_PREDICTED, EvaluationOutcome.DIFFERS)
-    document = evaluation_document(found, case, recording, run, log)
+    document = evaluation_document(found, case, recording, run, log, run_warnings(run))
     code = code_with(document["rehearsal"], ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
     return EvaluationConclusion(document, ExitCode(code))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError
 from tdhil.session.evaluation import load_document
 from tdhil.session.rehearsal import code_with
+from tdhil.session.run_warnings import run_warnings
 
 if TYPE_CHECKING:
     from tdhil.recording import Recording
@@ -81,7 +82,7 @@ def conclude_verification(recording: Recording, run: Mapping[str, Any], log: str
     found = verify_record(case, program, StepRecord(
         recording.time_s, recording.speed_rad_s, recording.fresh, recording.limited, starts, period_s,
         recording.timing_half_width_s, filter_s))
-    document = verification_document(found, case, program, recording, run, log)
+    document = verification_document(found, case, program, recording, run, log, run_warnings(run))
     codes = {StepOutcome.AGREES: ExitCode.OK, StepOutcome.DIFFERS: ExitCode.NOT_PASSED,
              StepOutcome.CANNOT_TELL: ExitCode.NOT_IDENTIFIABLE}
     return VerificationConclusion(document, ExitCode(code_with(document["rehearsal"], codes[found.outcome])))
