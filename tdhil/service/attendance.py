@@ -381,7 +381,7 @@ class ServiceOperator:
         from tdhil.session import motion_summary
 
         confirming = self._bind(preflight)
-        text = motion_summary(preflight, task.limits, task.request, unverified)
+        text = motion_summary(preflight, task.limits, task.request, unverified, task.case)
         if self._watched:
             text += ("  [ ] an operator watches the page that confirms, for the whole run: the shaft brakes once it\n"
                      f"      is hidden or closed for {LEASE_S:g} s\n")

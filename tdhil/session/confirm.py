@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 
@@ -19,6 +19,10 @@ from profiles.quantities import RPM
 from tdhil.recording import LiveInertia
 from tdhil.report import LiveDisplay, minutes
 from tdhil.runner import Display, ExcitationRequest, Idle, MachineLimits, Task
+
+if TYPE_CHECKING:
+    from tdhil.soft_torque import EvaluationCase
+    from tdhil.speed_loop import StepCase
 
 T = TypeVar("T")
 
@@ -48,7 +52,7 @@ def confirm_motion(
     if preflight.identity.simulated:
         return
     pause_display()
-    console.print(motion_summary(preflight, task.limits, task.request, unverified), markup=False)
+    console.print(motion_summary(preflight, task.limits, task.request, unverified, task.case), markup=False)
     if yes:
         console.print("Confirmed by --yes.")
         return
@@ -154,9 +158,13 @@ def turns_text(speed_rad_s: float) -> str:
 
 
 def motion_summary(
-    preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = ()
+    preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = (),
+    case: EvaluationCase | StepCase | None = None,
 ) -> str:
-    """Return the planned motion and the checklist. ``unverified``: profile entries that the operator accepted."""
+    """Return the planned motion and the checklist. ``unverified``: profile entries that the operator accepted.
+
+    ``case``: the motion in place of an excitation.
+    """
     silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.safe_action.replace('_', ' ')}"
     watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
     if preflight.watched and preflight.fed_by_any_client:
@@ -167,7 +175,7 @@ def motion_summary(
         f"  speed window    {limits.speed_min_rad_s:.4g} to {limits.speed_max_rad_s:.4g} rad/s "
         f"({RPM.of_si(limits.speed_min_rad_s):.4g} to {RPM.of_si(limits.speed_max_rad_s):.4g} rpm)\n"
         f"  peak torque     {limits.torque_nm:g} N·m\n"
-        f"  excitation      {request.kind}\n"
+        f"  excitation      {request.kind if case is None else case.motion}\n"
         f"  duration        at most {minutes(limits.time_s)}\n"
         f"  watchdog        {watchdog}\n"
         f"{_taken(unverified)}"
@@ -290,7 +298,7 @@ class CallbackOperator(TerminalOperator):
         if preflight.identity.simulated:
             return
         self._display.pause()
-        text = motion_summary(preflight, task.limits, task.request, unverified)
+        text = motion_summary(preflight, task.limits, task.request, unverified, task.case)
         if _meanwhile(idle, partial(self._ask, text)) is not True:
             raise PreflightRefused("the motion was not confirmed", where="confirm", next_step="Nothing has moved",
                                    entry=MessageCode.NOT_CONFIRMED)

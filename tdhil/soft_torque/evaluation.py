@@ -96,6 +96,11 @@ class EvaluationCase:
         return "speed" if self.own_loop else "torque"
 
     @property
+    def motion(self) -> str:
+        """Return the motion of stage 5, for the confirmation."""
+        return f"virtual drill string with stick-slip of its bit, in {self.mode} mode"
+
+    @property
     def torque_offset(self) -> bool:
         """Return whether stage 5 writes the drive's torque offset."""
         return self.own_loop

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from math import ceil, exp, pi, sqrt
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -60,6 +60,7 @@ class StepCase:
     """Time constant of the reported speed."""
     source: str = ""
     """File of the tuning."""
+    motion: ClassVar[str] = "small steps of the set speed"     # of stage 5, for the confirmation
 
     @property
     def mode(self) -> Literal["speed", "torque"]:

@@ -15,6 +15,8 @@ from tdhil.runner.settings import ExcitationRequest
 from tdhil.session.confirm import motion_summary
 from tdhil.session.task import machine_limits
 from tests.rigs import LIMITS, rig_file
+from tests.soft_torque.test_evaluation import CASE as STRING
+from tests.speed_loop.test_verification import CASE as STEPS
 
 ACTS = "Check the cable; the drive's own watchdog stops the shaft"
 
@@ -34,6 +36,13 @@ def test_the_confirmation_says_it_and_asks_for_somebody_at_the_stop() -> None:
     assert "watchdog        NONE, accepted by --accept-no-watchdog: the drive will not stop by itself" in unarmed
     assert "[ ] an operator stays at that stop for the whole run" in unarmed
     assert unarmed.count("[ ]") == armed.count("[ ]") + 1
+
+
+def test_the_confirmation_names_the_motion_of_a_run_without_an_excitation() -> None:
+    for case, said in ((STEPS, "small steps of the set speed"), (STRING, "virtual drill string")):
+        text = motion_summary(preflight(0.5), LIMITS, ExcitationRequest(), (), case)
+        assert f"excitation      {said}" in text and "multisine" not in text
+    assert "excitation      multisine" in motion_summary(preflight(0.5), LIMITS, ExcitationRequest())
 
 
 def test_it_is_not_the_default_and_no_file_says_it(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
 
     monkeypatch.setattr("sys.stdin", None)
     monkeypatch.setattr("tdhil.session.confirm.motion_summary", lambda *_: "")
-    task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest)
+    task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest, case=None)
     preflight = SimpleNamespace(identity=Identity(1, 2, 3, 4, "drive", False))
     with pytest.raises(PreflightRefused, match="no operator can confirm"):
         confirm_motion(
