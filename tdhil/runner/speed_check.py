@@ -13,6 +13,7 @@ Encoders, gears and slip of good rigs stay within a few per cent; wrong units gi
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -186,6 +187,9 @@ SILENT = 5
 """Missed readings in a row after which the drive counts as without a position."""
 SEEN_S = 3.0
 """Averaging time of the speed that the operator confirms, s."""
+SETTLED_SHARE, SETTLED_COUNTS, SETTLED_S, SETTLE_S = 0.1, 0.6, 0.5, 10.0
+"""Share of the setpoint, and counts, within which the mean reported speed of this time, s, is at the setpoint; and the
+longest wait for that, s."""
 TURNS_WAITED = 3.2
 """Turns to wait for at the slow speed, for a counter of whole turns."""
 LONGEST_WAIT_S = 60.0     # s; longest wait for these turns
@@ -239,6 +243,7 @@ class SpeedUnitCheck:
         self._silent = 0
         self._usual_half_s = math.inf              # time uncertainty of a reading
         self._highest_rad_s = 0.0                  # highest setpoint so far
+        self._recent_rad_s: deque[float] = deque(maxlen=loop.cycles(SETTLED_S))    # reported
         self._done = False
         self._lost = ""                            # why there is no position
         self._watching = False
@@ -358,7 +363,9 @@ class SpeedUnitCheck:
     # -- waiting, comparing, asking --------------------------------------------------------------------------
 
     def _cycle(self, speed_rad_s: float) -> Sample:
-        return self._loop.cycle(Command(Mode.SPEED, speed_rad_s, 0.0))
+        sample = self._loop.cycle(Command(Mode.SPEED, speed_rad_s, 0.0))
+        self._recent_rad_s.append(sample.speed_rad_s)
+        return sample
 
     def _waited(self, speed_rad_s: float, seconds: float) -> Iterator[None]:
         for _ in range(self._loop.cycles(seconds)):
@@ -372,6 +379,7 @@ class SpeedUnitCheck:
             for _ in self._waited(speed_rad_s, self._lag_s):
                 if not paused.until_compared and self._follows(speed_rad_s):
                     return
+            self._settle(speed_rad_s)
             self._angles.restart()
             turn_s = 2.0 * math.pi / abs(speed_rad_s)
             longest_s = min(LONGEST_WAIT_S, max(2.0 * self._lag_s + 3.0, TURNS_WAITED * turn_s))
@@ -385,6 +393,18 @@ class SpeedUnitCheck:
             if self._too_fast(speed_rad_s):
                 self._refuse(f"the position moves too fast for the commanded {speed_rad_s:.3g} rad/s", command)
         self._ask(command)
+
+    def _settle(self, speed_rad_s: float) -> None:
+        """Wait until the reported speed is at the setpoint, for `SETTLE_S` at most.
+
+        The sign probe may leave the shaft faster. While it slows down, the lag of the report would count as travel.
+        """
+        near_rad_s = max(SETTLED_SHARE * abs(speed_rad_s), SETTLED_COUNTS * self._resolution_rad_s)
+        for _ in range(self._loop.cycles(SETTLE_S)):
+            mean_rad_s = math.fsum(self._recent_rad_s) / len(self._recent_rad_s)
+            if self._lost or abs(mean_rad_s - speed_rad_s) <= near_rad_s:
+                return
+            self._cycle(speed_rad_s)
 
     def _judge(self, ratio: TravelRatio, command: Command) -> None:
         """Compare the ratio with one. Raises PreflightRefused. For a frozen position ask the operator."""

@@ -143,6 +143,24 @@ def test_a_coarse_angle_is_compared_at_the_slow_speed(counts):
     assert checked.unit["ratio"] == pytest.approx(1.0, abs=0.05)
 
 
+class Slowing(Shaft):
+    """A shaft that the sign probe left faster than the slow speed. Its report lags by 0.4 s."""
+
+    reported_rad_s = 0.0
+
+    def exchange(self, command):
+        told = super().exchange(command)
+        extra_rad_s = 3.0 * math.exp(-self.time_s / 2.0)
+        self.angle_rad += extra_rad_s * PERIOD_S
+        self.reported_rad_s += PERIOD_S / 0.4 * (told.speed_rad_s + extra_rad_s - self.reported_rad_s)
+        return told._replace(speed_rad_s=self.reported_rad_s)
+
+
+def test_no_lag_counts_as_travel_while_the_shaft_still_slows_down():
+    checked = Checked(Slowing(), mean_rad_s=0.6)
+    assert checked.refused is None and checked.loop.compared[0] == pytest.approx(1.0, abs=0.04)
+
+
 @pytest.mark.parametrize(("unit", "said"), [(1.015, False), (0.985, False), (1.05, True), (0.95, True)])
 def test_a_small_difference_is_said_from_two_percent_on(unit, said):
     checked = Checked(Shaft(unit))
