@@ -172,6 +172,16 @@ def printed_ends(low: float, high: float, decimals: int) -> tuple[str, str]:
     return found[0], found[1]
 
 
+def printed_share(share: float) -> str:
+    """Return ``±0.80 %`` for 0.008, the half-width of an interval as a share: two significant digits, rounded up."""
+    if not math.isfinite(share):
+        return "±?"
+    percent = 100.0 * share
+    if percent <= 0.0:
+        return "±0 %"
+    return f"±{printed_ends(0.0, percent, 1 - math.floor(math.log10(percent)))[1]} %"
+
+
 def printed_interval(low: float, high: float, digits: int = 4, sign: bool = False) -> str:
     """Return ``103.1 to 104.8``: some significant digits of the larger end, rounded outwards, without zeros at the end.
 

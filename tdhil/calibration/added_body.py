@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles.quantities import printed_share
 from tdhil.estimation import ResidualTest, Verdict
 from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
 from tdhil.recording import FloatArray
@@ -175,7 +176,7 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
     assumed = student_quantile(case.confidence, CERTAIN) * case.scale_rel_sd
     if inertia.half_width_share > assumed:
         reason = (f"the body of {float(np.ptp(added)):.4g} kg·m² is too small: it would leave J at "
-                  f"±{100 * inertia.half_width_share:.1f} %, and the stated torque scale leaves "
+                  f"{printed_share(inertia.half_width_share)}, and the stated torque scale leaves "
                   f"±{100 * assumed:.1f} %")
         advice = "measure for longer, and state how well the body's inertia is known (--added-sd)"
         if least is not None:
@@ -188,8 +189,8 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
         return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value),
                        reason=f"the calibration factor would be {factor.value:.3g}: more than {100 * most:.0f} % from "
                        "1 is no error of a torque scale")
-    reason = (f"the runs give κ to ±{100 * factor.half_width_share:.2f} % and J to "
-              f"±{100 * inertia.half_width_share:.2f} %")
+    reason = (f"the runs give κ to {printed_share(factor.half_width_share)} and J to "
+              f"{printed_share(inertia.half_width_share)}")
     return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia)
 
 

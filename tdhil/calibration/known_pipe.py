@@ -16,6 +16,7 @@ middle.
 import math
 from dataclasses import dataclass
 
+from profiles.quantities import printed_share
 from tdhil.calibration.added_body import (
     LARGEST_ERROR,
     FactorLine,
@@ -112,7 +113,7 @@ def calibrate_known_pipe(
     if factor.half_width_share >= typed:
         worst = max(budget, key=lambda line: line.of_factor)
         return KnownPipeFit(
-            factor, budget, typed, f"the pipe gives κ = {value:.3f} to ±{100 * factor.half_width_share:.1f} % only, "
+            factor, budget, typed, f"the pipe gives κ = {value:.3f} to {printed_share(factor.half_width_share)} only, "
             f"which is wider than the torque scale as stated so far (±{100 * typed:.1f} %); "
             f"most comes from: {worst.source}",
             "state the measured sizes of the pipe with their tolerances in string.yaml, or use a body of known inertia")

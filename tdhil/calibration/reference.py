@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles.quantities import printed_share
 from tdhil.calibration.added_body import (
     LARGEST_ERROR,
     FactorLine,
@@ -438,7 +439,7 @@ def _judged(
     if factor.half_width_share > assumed:
         return replace(
             found, refusal=f"the torque varies too little: {found.swing_nm:.3g} N·m leave κ at"
-            f" ±{100 * factor.half_width_share:.1f} %, and the stated torque scale leaves ±{100 * assumed:.1f} %",
+            f" {printed_share(factor.half_width_share)}, and the stated torque scale leaves ±{100 * assumed:.1f} %",
             advice="change the torque by more, in steps and slowly, or record for longer")
     if abs(k - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:
         return replace(

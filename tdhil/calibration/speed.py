@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from profiles.quantities import printed_share
 from tdhil.calibration.added_body import LARGEST_ERROR, MeasuredValue, measured_value
 from tdhil.estimation import RATIOS_ALIKE, AngleRatio, Verdict
 from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
@@ -140,7 +141,7 @@ def _concluded(
             advice = f"count {least} turns or more at this speed, or state a smaller uncertainty of what was read"
         return SpeedCalibration(
             Verdict.NOT_IDENTIFIABLE, f"the measurement is too short: it would leave the factor at "
-            f"±{100 * factor.half_width_share:.2f} %, and ±{100 * wanted:.2f} % is wanted",
+            f"{printed_share(factor.half_width_share)}, and ±{100 * wanted:.2f} % is wanted",
             advice, method, budget=budget, least_turns=least)
     if not abs(value - 1.0) <= LARGEST_ERROR + factor.half_width_share:
         return SpeedCalibration(
@@ -148,5 +149,5 @@ def _concluded(
             f"{100 * LARGEST_ERROR:.0f} % from 1 is no error of a scale but a wrong unit",
             "check the unit of speed in the profile, the counted turns, and the shaft at which they were counted "
             "(--at motor or main)", method, budget=budget)
-    return SpeedCalibration(Verdict.VALID, f"the factor is known to ±{100 * factor.half_width_share:.2f} %", "", method,
-                            factor, budget)
+    return SpeedCalibration(Verdict.VALID, f"the factor is known to {printed_share(factor.half_width_share)}", "",
+                            method, factor, budget)

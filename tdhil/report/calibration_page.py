@@ -17,7 +17,7 @@ from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection,
 from tdhil.report.card import sentence
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import NO_REAL_SHAFT, SIMULATED
-from tdhil.report.intervals import interval_and_share
+from tdhil.report.intervals import interval_and_share, percent, rounded
 
 if TYPE_CHECKING:
     from tdhil.calibration import MeasuredValue
@@ -46,9 +46,12 @@ def with_share(part: Part, unit: str) -> str:
 
 
 def scale_error(factor: Part, quantity: str = "torque") -> str:
-    """Return the error of the drive's own quantity: ``4.8 % too much torque``."""
-    error = 100.0 * (1.0 / factor["value"] - 1.0)
-    return f"{abs(error):.2g} % too {'much' if error > 0.0 else 'little'} {quantity}"
+    """Return the error of the drive's own quantity, with the digits of its interval: ``4.8 % too much torque``."""
+    error, high, low = (100.0 * (1.0 / factor[name] - 1.0) for name in ("value", "low", "high"))
+    text = rounded(error, low, high)[0].removeprefix("-")
+    if not float(text):
+        return f"the true {quantity} to {percent(0.5 * (high - low), 100.0)}"
+    return f"{text} % too {'much' if error > 0.0 else 'little'} {quantity}"
 
 
 def print_calibration_card(

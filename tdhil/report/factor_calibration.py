@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from profiles.quantities import printed_share
 from tdhil.report.blocks import Block, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
     calibrated_item,
@@ -50,7 +51,7 @@ def pairs_document(
     return {
         **_begun(PAIRS, "model_rejected" if found.refusal else "valid",
                  found.refusal or (f"{len(pairs.direction)} pairs give κ to "
-                                   f"±{100 * found.factor.half_width_share:.2f} %"), ""),
+                                   f"{printed_share(found.factor.half_width_share)}"), ""),
         "calibration_factor": None if found.refusal else quantity(found.factor, confidence),
         "offset_nm": quantity(found.offset_nm, confidence),
         "budget": _budget_lines(found.budget),
@@ -78,7 +79,7 @@ def reference_document(
     factor = found.factor
     reason = found.refusal
     if not reason and factor is not None:
-        reason = (f"{found.overlap_s:.0f} s of both records give κ to ±{100 * factor.half_width_share:.2f} %")
+        reason = (f"{found.overlap_s:.0f} s of both records give κ to {printed_share(factor.half_width_share)}")
     series = found.series
     return {
         **_begun(REFERENCE, "not_identifiable" if found.refusal else "valid", reason, found.advice),
@@ -109,7 +110,7 @@ def known_pipe_document(
     verdict = "not_identifiable" if reason else "valid"
     factor = None if found is None else quantity(found.factor, confidence)
     if found is not None and not reason:
-        reason = (f"the pipe gives κ to ±{100 * found.factor.half_width_share:.2f} %; the torque scale as stated so "
+        reason = (f"the pipe gives κ to {printed_share(found.factor.half_width_share)}; the torque scale as stated so "
                   f"far leaves ±{100 * found.typed_half_width:.1f} %")
     return {
         **_begun(KNOWN_PIPE, verdict, reason, advice),
@@ -171,8 +172,8 @@ def _pairs_rows(document: Part) -> Iterator[tuple[str, str]]:
     yield "scatter", _scatter(document)
     yield "hysteresis", _hysteresis(document)
     for pair in document["pairs"]:
-        yield "pair", (f"{pair['reported_nm']:9.2f} N·m reported, {pair['reference_nm']:9.2f} N·m true,"
-                       f" {pair['residual_nm']:+.2g}, {pair['direction']}")
+        yield "pair, N·m", (f"{pair['reported_nm']:9.2f} reported, {pair['reference_nm']:9.2f} true,"
+                            f" residual {pair['residual_nm']:+.2g}, {pair['direction']}")
 
 
 def _scatter(document: Part) -> str:

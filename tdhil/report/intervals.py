@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from profiles.quantities import plain_number, printed_ends
+from profiles.quantities import plain_number, printed_ends, printed_share
 
 ASYMMETRIC = 1.2
 """Ratio of the longer to the shorter side from which an interval is printed by its ends. Below it ± the longer side is
@@ -61,10 +61,7 @@ def two_digits(half_width: float) -> str:
 
 def percent(half_width: float, value: float) -> str:
     """Return ``±0.80 %`` of the value: two significant digits, rounded up."""
-    if not value or not math.isfinite(half_width):
-        return "±?"
-    share = 100.0 * half_width / abs(value)
-    return f"±{printed_ends(0.0, share, _decimals(share))[1] if share > 0.0 else '0'} %"
+    return printed_share(half_width / abs(value)) if value else "±?"
 
 
 def interval_and_share(value: float, low: float, high: float, unit: str) -> str:

@@ -1,6 +1,7 @@
 """Pairs of a reference sensor: York's line against scipy.odr, its coverage, hysteresis, and what is refused."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -94,7 +95,10 @@ def test_the_command_prints_a_card_and_a_document(tmp_path, capsys):
     rows = [f"{x},1,{0.95 * x},0.5,{way}\n" for x in (0, 50, 100, 200) for way in ("up", "down")]
     path.write_text(HEADER + "".join(rows))
     assert main(["calibrate", "torque", "--pairs", str(path)]) == 0
-    assert "calibration factor" in capsys.readouterr().out
+    card = capsys.readouterr().out
+    (share,) = re.findall(r"calibration factor .* (±[\d.]+ %)", card)
+    assert f"8 pairs give κ to {share}." in card          # one half-width, rounded up in both places
+    assert "pair, N·m" in card and "200.00 reported,    190.00 true, residual" in card
     assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["calibration_factor"]["value"] == pytest.approx(0.95)

@@ -13,6 +13,7 @@ from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.estimation import AngleRatio, mean_speed
 from tdhil.recording import Level
+from tdhil.report.calibration_page import scale_error
 from tdhil.session import RunRecord, TurnsCount, add_speed_calibration, speed_by_position, speed_by_turns
 from tests.calibration.bodies import IDENTITY
 from tests.estimation.reporting import recorded
@@ -138,13 +139,24 @@ def test_what_is_no_request_ends_with_2(more, capsys):
 
 def test_the_command_prints_a_card_a_document_and_refuses(capsys):
     assert main(["calibrate", "speed", *COUNTED]) == 0
-    assert "true speed = κ" in " ".join(capsys.readouterr().out.split())
+    card = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert "true speed = κ" in card and "0.56 % too little speed" in card
+    assert "(0.9999 to 1.0113) ±0.57 %" in card and "The factor is known to ±0.57 %." in card     # 0.564 % both times
     assert main(["calibrate", "speed", "--turns", "25", "--seconds", "312.4", "--speed", "2.0", "--at", "main",
                  "--gear", "4", "--want", "5%", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["calibration_factor"]["value"] == pytest.approx(math.pi / 3.124)
     assert document["inputs"]["turns_sd"] == 1.0 and len(document["warnings"]) == 3
     assert main(["calibrate", "speed", "--turns", "10", "--seconds", "31.2", "--speed", "2"]) == 9
+
+
+@pytest.mark.parametrize(("value", "half", "words"), [
+    (1.0 / 1.0457, 0.0096, "4.6 % too much speed"), (1.0 / 1.04857, 0.0021, "4.86 % too much speed"),
+    (1.0056, 0.0057, "0.56 % too little speed"), (0.9999984, 0.0019, "the true speed to ±0.20 %"),
+    (1.0000016, 0.0019, "the true speed to ±0.20 %"),
+])
+def test_the_error_of_a_scale_has_the_digits_of_its_interval(value, half, words):
+    assert scale_error({"value": value, "low": value - half, "high": value + half}, "speed") == words
 
 
 def test_the_file_has_a_section_and_keeps_the_torque(tmp_path, capsys):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from profiles.quantities import printed_interval
+from profiles.quantities import printed_interval, printed_share
 from tdhil.report.blocks import report_of
 from tdhil.report.card import (
     card_text,
@@ -109,6 +109,11 @@ def test_a_cell_of_a_table_rounds_its_interval_outwards_and_writes_no_powers_of_
     assert table_cell({"value": 1603.4, "low": 1603.4, "high": 1603.4}) == "1603"
     assert table_cell({"value": 2.4, "low": 2.29, "high": None}) == "2.4 (2.29 to open)"
     assert table_cell({"value": None, "low": None, "high": None}) == "–"
+
+
+def test_a_half_width_in_percent_is_never_less_than_the_true_one():
+    shown = [printed_share(one) for one in (0.01001, 0.0100, 0.0000123, 0.1234, 1.5, 0.0, float("inf"))]
+    assert shown == ["±1.1 %", "±1.0 %", "±0.0013 %", "±13 %", "±150 %", "±0 %", "±?"]
 
 
 def test_a_printed_interval_contains_the_true_one():
