@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from profiles import visible
 from tdhil.cli.arguments import add_option
 from tdhil.config import OF_EVIDENCE, EvidenceOptions
 from tdhil.errors import ExitCode, MessageCode, UsageError, existing_file
@@ -104,12 +106,17 @@ def _check(namespace: argparse.Namespace) -> int:
     if given := [*stated, *(["--serial-key"] if namespace.serial_key is not None else [])]:
         raise UsageError(f"has no effect with {_OF_THE_CHECK}, which makes no archive", where=" ".join(given),
                          next_step="Nothing was checked. Leave it out")
+    digest = (namespace.sha256 or "").strip()
+    if namespace.sha256 is not None and not re.fullmatch("[0-9a-fA-F]{64}", digest):
+        raise UsageError(f"{visible(digest)[:80]!r} is not a SHA-256, which has 64 hexadecimal digits",
+                         where="--sha256", next_step="Nothing was checked. Give all digits of the file .sha256",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
     try:
         archive = path.read_bytes()
     except OSError as error:
         raise UsageError(f"can't be read ({error.strerror or error})", where=str(path),
                          entry=MessageCode.FILE_NOT_FOUND) from error
-    found = check_evidence(archive, namespace.sha256 or "")
+    found = check_evidence(archive, digest)
     _show(found, path)
     return int(ExitCode.NOT_PASSED if found.problems else ExitCode.OK)
 

@@ -26,7 +26,7 @@ def test_an_archive_is_made_with_its_digest_and_passes_its_check(log, tmp_path):
     archive = tmp_path / "run.evidence.zip"
     digest, name = (tmp_path / "run.evidence.zip.sha256").read_text().split()
     assert name == archive.name and done.out.split()[0] == digest
-    passed = tdhil("evidence", "--check", archive, "--sha256", digest)
+    passed = tdhil("evidence", "--check", archive, "--sha256", f" {digest.upper()}")
     assert passed.code == 0 and "passes" in passed.out
     again = tdhil("evidence", log, *STATED)
     assert again.code == 2 and "not overwritten" in again.err
@@ -51,6 +51,8 @@ def test_permission_is_never_assumed(log, tmp_path):
     ((), "no log is named"), (("--check", "none.zip"), "can't be read"), (("none.mcap", *STATED), "does not exist"),
     (("--check", "y.zip", "--publisher", "A", "--serial-key", "k"), "--publisher --serial-key: has no effect"),
     (("x.mcap", "--check", "y.zip"), "makes no archive"), (("x.mcap", "--sha256", "00"), "--sha256"),
+    (("--check", "y.zip", "--sha256", "3f0c…"), "'3f0c…' is not a SHA-256, which has 64 hexadecimal digits"),
+    (("--check", "y.zip", "--sha256", ""), "Nothing was checked"),
 ])
 def test_wrong_use_is_said(words, said):
     done = tdhil("evidence", *words)
