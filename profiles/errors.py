@@ -42,7 +42,7 @@ class TdhilError(Exception):
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
-        text = f"{text}. {self.next_step}" if self.next_step else text
+        text = f"{text}{'' if text.endswith('?') else '.'} {self.next_step}" if self.next_step else text
         return visible(_FLAG.sub(lambda found: self.spelling.get(found[0], found[0]), text), keep="\n")
 
 

@@ -84,6 +84,7 @@ def _dry_run_steps(
     from tdhil.runner.stages import MOST_LONGER
 
     console = PlainConsole()
+    console.print("DRY RUN: nothing is connected, nothing moves", style="magenta")
     if simulated:
         console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
     console.print(
@@ -91,8 +92,7 @@ def _dry_run_steps(
         f"between {program.low_rad_s:.3g} and {program.high_rad_s:.3g} rad/s, {program.duration_s:.0f} s; limits "
         f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m, "
         f"{limits.time_s:g} s. A run first measures friction, and then plans again. If P or I is not known well enough "
-        f"after these pairs, more follow: at most {MOST_LONGER:g} times as many in total, within the time limit.",
-        soft_wrap=True)
+        f"after these pairs, more follow: at most {MOST_LONGER:g} times as many in total, within the time limit.")
     return 0
 
 

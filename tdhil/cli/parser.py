@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from tdhil.errors import MessageCode, UsageError
@@ -64,11 +65,20 @@ class CommandParser(argparse.ArgumentParser):
         if self.usual_action and args is not None:
             actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
             if not args or args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
+                self._refuse_misspelt(args, actions.choices)
                 args = [self.usual_action, *args]
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             raise self._unknown(unknown)
         return found, unknown
+
+    def _refuse_misspelt(self, words: Sequence[str], actions: Iterable[str]) -> None:
+        """Refuse a first word that is no file and resembles an action. The default action would take it as a file."""
+        from tdhil.cli.arguments import meant
+
+        word = words[0] if words else "-"
+        if not word.startswith("-") and (hint := meant(word, actions)) and not Path(word).exists():
+            raise self._refusal(f"there is no action {word[:40]}", MessageCode.USAGE, hint)
 
     def _unknown(self, words: list[str]) -> UsageError:
         from tdhil.cli.arguments import meant

@@ -111,8 +111,8 @@ def _rows(document: Part) -> Iterator[tuple[str, str]]:
     yield from rehearsal_rows(document.get("rehearsal"))
     yield "gains", f"{document['tuned_for']['kind']}, of {document['tuned_for']['source']}"
     steps = document["steps"]
-    yield "steps", (f"{steps['counted_pairs']} pairs of ±{steps['step_rad_s']:.3g} rad/s at "
-                    f"{steps['low_rad_s']:.3g} rad/s, {steps['half_s']:.3g} s each")
+    yield "steps", (f"{steps['counted_pairs']} pairs: {steps['step_rad_s']:.3g} rad/s up from "
+                    f"{steps['low_rad_s']:.3g} rad/s and down again, {steps['half_s']:.3g} s each")
     rms = document["misfit"]["rms_share"]
     if rms is not None:
         yield "misfit", f"{100.0 * rms:.2g} % of the step (rms), p {document['misfit']['p']:.2g}"

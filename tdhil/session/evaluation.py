@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 SAME_STRING = 1e-6
 _CONFIDENCE = 0.95        # confidence of the interval of the torque ratio
-_TUNE_AGAIN = "tdhil tune soft-torque result.json --string string.yaml --json > tune.json"
+_TUNE_AGAIN = "Write one with: tdhil tune soft-torque result.json --string string.yaml --json > tune.json"
 
 
 def load_document(path: Path, wanted: str, keys: frozenset[str], next_step: str) -> Mapping[str, Any]:
@@ -29,7 +29,8 @@ def load_document(path: Path, wanted: str, keys: frozenset[str], next_step: str)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UsageError(f"is not JSON ({str(error)[:80]})", where=str(path), next_step=next_step,
+        why = "" if isinstance(error, UnicodeDecodeError) else f" ({str(error)[:80]})"
+        raise UsageError(f"is not JSON{why}", where=str(path), next_step=next_step,
                          entry=MessageCode.NOT_A_TUNING) from None
     if not isinstance(document, dict) or not keys <= document.keys():
         raise UsageError(f"is JSON, but not a {wanted}", where=str(path), next_step=next_step,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 VERIFICATION = "verification"
 """Key of the run's configuration, and kind of the document."""
-_TUNE_AGAIN = "tdhil tune speed result.json --json > tune.json"
+_TUNE_AGAIN = "Write one with: tdhil tune speed result.json --json > tune.json"
 _KEYS = frozenset({"plant", "controllers", "reported_speed_lag_s"})
 
 

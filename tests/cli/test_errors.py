@@ -2,6 +2,7 @@
 
 import json
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -86,6 +87,26 @@ def test_a_command_that_there_is_not_is_named_with_what_was_meant(
 ) -> None:
     assert main([typed, "logs"]) == 2
     assert capsys.readouterr().err == f"tdhil: there is no command '{typed}'. {meant}See tdhil --help [TDH-201]\n"
+
+
+@pytest.mark.parametrize(("typed", "said"), [
+    ("sped", "tdhil: tune: there is no action sped. Did you mean 'speed'? See tdhil tune --help [TDH-200]\n"),
+    ("result.jsn", "tdhil: result.jsn: this file does not exist."),
+    ("verfy", "tdhil: verfy: this file does not exist."),         # here a file of that name is meant: it exists
+])
+def test_a_misspelt_action_is_no_file(
+    typed: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if typed == "verfy":
+        (tmp_path / typed).mkdir()
+    assert main(["tune", typed, *(["r.json"] if typed == "sped" else [])]) == 2
+    assert capsys.readouterr().err.startswith(said)
+
+
+def test_after_a_question_there_is_no_full_stop() -> None:
+    assert str(UsageError("did you mean 'time'?", where="--columns", next_step="Such as: time=t_s")) == (
+        "--columns: did you mean 'time'? Such as: time=t_s")
 
 
 def test_without_json_a_wrong_value_is_a_line_on_stderr_alone(capsys: pytest.CaptureFixture[str]) -> None:

@@ -27,13 +27,31 @@ def tuned(tmp_path, capsys):
     return document, path
 
 
-def test_the_plan_stays_within_the_limits_and_moves_nothing(tuned, capsys):
+def test_the_plan_stays_within_the_limits_and_moves_nothing(tuned, capsys, monkeypatch):
     _, path = tuned
     assert main(["tune", "verify", str(path), "--simulate", "--dry-run", "--json"]) == 0
     plan = json.loads(capsys.readouterr().out)
     limits = plan["limits"]
     assert limits["speed_min_rad_s"] < plan["low_rad_s"] < plan["high_rad_s"] < limits["speed_max_rad_s"]
     assert plan["step_torque_nm"] < plan["limits"]["torque_nm"] and plan["duration_s"] < plan["limits"]["time_s"]
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["tune", "verify", str(path), "--simulate", "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("DRY RUN: nothing is connected, nothing moves\nSIMULATED")
+    assert max(map(len, text.splitlines())) <= 80 and f"{plan['pairs']} pairs of steps" in text
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (b"\x89MCAP0\r\n", "is not JSON. Write one with: tdhil tune speed result.json --json > tune.json"),
+    (b"{}", "is JSON, but not a tuning of tdhil tune speed. Write one with: tdhil tune speed"),
+    (None, "does not exist. Write one with: tdhil tune speed"),
+])
+def test_a_file_of_another_kind_is_named_with_the_command_that_writes_it(tmp_path, capsys, content, said):
+    path = tmp_path / "tune.json"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["tune", "verify", str(path), "--simulate"]) == ExitCode.USAGE
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("change", "words", "message"), [

@@ -33,7 +33,9 @@ def printed(show, document) -> str:
 def test_the_terminal_marks_an_evaluation_and_a_verification():
     log = rows(57.0, (57.5,))
     assert f"· {MARKS}" in printed(print_evaluation, evaluated(log) | FAULTED)
-    assert f"verified by steps · {MARKS}" in printed(print_verification, VERIFIED | FAULTED)
+    verified = printed(print_verification, VERIFIED | FAULTED)
+    assert f"verified by steps · {MARKS}" in verified
+    assert "3 pairs: 0.1 rad/s up from 1 rad/s and down again, 2 s each" in verified
     plain = VERIFIED | {"simulated": True, "rehearsed_faults": []}
     assert "· SIMULATED" in printed(print_verification, plain) and "REHEARSAL" not in printed(print_verification, plain)
 
