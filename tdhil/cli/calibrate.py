@@ -98,10 +98,11 @@ def run_torque(namespace: argparse.Namespace) -> int:
     require_new(namespace.save)
     report = ReportFile.of_files(namespace, *(path for path, _, _ in wanted))
     runs = _read(namespace, wanted)
-    from tdhil.report import PlainConsole, calibration_report, print_calibration, stderr_console
+    from tdhil.report import PlainConsole, calibration_report, print_calibration, stderr_console, working
     from tdhil.session import document_of_calibration, find_calibration, save_calibration
 
-    found = find_calibration(runs, namespace.at, confidence)
+    with working("fitting the runs together …"):
+        found = find_calibration(runs, namespace.at, confidence)
     document = document_of_calibration(found)
     if namespace.json:
         print_json(document)
@@ -175,7 +176,7 @@ def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]
 
 
 def _plan(namespace: argparse.Namespace) -> int:
-    from tdhil.report import PlainConsole
+    from tdhil.report import PlainConsole, working
     from tdhil.session import ASSUMED_BODY_REL_SD, find_plan, require_file
 
     if len(namespace.logs) != 1 or namespace.body:
@@ -196,7 +197,8 @@ def _plan(namespace: argparse.Namespace) -> int:
         sd_share = namespace.added_sd / namespace.added
     ratio = record.recording.gear_ratio if namespace.at == "main" else 1.0
     sizes = () if namespace.added is None else (namespace.added / ratio**2,)
-    inertia, minutes, plans = find_plan(record, namespace.want, sd_share, sizes)
+    with working("identifying …"):
+        inertia, minutes, plans = find_plan(record, namespace.want, sd_share, sizes)
     document = {
         "kind": "torque_calibration_plan", "inertia_kg_m2": inertia, "minutes": minutes, "want": namespace.want,
         "added_rel_sd": sd_share, "at": namespace.at,

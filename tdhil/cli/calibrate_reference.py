@@ -103,22 +103,26 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
 
 
 def _reference(namespace: argparse.Namespace, confidence: float) -> _Found:
+    from tdhil.report import working
     from tdhil.session import find_by_reference, require_file
 
     if namespace.reference_sd is not None and not 0.0 <= namespace.reference_sd < 1.0:
         raise UsageError(f"{namespace.reference_sd:g}: must be a share from 0 to below 1", where="--reference-sd")
     record = _one_log(namespace, "reference")
     require_file(namespace.reference)
-    return find_by_reference(record, namespace.reference, namespace.column, namespace.at, namespace.reference_sd,
-                             confidence), record
+    with working("comparing both torques …"):
+        return find_by_reference(record, namespace.reference, namespace.column, namespace.at, namespace.reference_sd,
+                                 confidence), record
 
 
 def _known_pipe(namespace: argparse.Namespace, confidence: float) -> _Found:
+    from tdhil.report import working
     from tdhil.session import find_by_known_pipe, require_file
 
     record = _one_log(namespace, "known_pipe")
     require_file(namespace.known_pipe)
-    return find_by_known_pipe(record, namespace.known_pipe, confidence), record
+    with working("fitting the string …"):
+        return find_by_known_pipe(record, namespace.known_pipe, confidence), record
 
 
 _KINDS = {"pairs": _pairs, "reference": _reference, "known_pipe": _known_pipe}

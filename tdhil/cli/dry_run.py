@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from profiles.quantities import RPM, in_nm
@@ -29,10 +28,9 @@ def _shown_limits(limits: MachineLimits) -> dict[str, float]:
 
 def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Profile) -> int:
     """Plan and print; exit code 0. Raises PreflightRefused if no plan is possible, as a run would."""
-    from tdhil.report import stderr_console
+    from tdhil.report import working
 
-    stderr = stderr_console()
-    with stderr.status("planning …") if stderr.is_terminal else nullcontext():
+    with working("planning …"):
         planned, figures, limits = plan_dry(options, rig, simulated, profile)
     if options.json:
         plain = plan_document(planned, figures, limits)

@@ -49,6 +49,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _make(namespace: argparse.Namespace) -> int:
     from tdhil.evidence import flag_of, make_evidence, names_of_this_computer, statement_of, wrong_in
+    from tdhil.report import working
     from tdhil.session import require_file
 
     log: Path = namespace.log
@@ -64,7 +65,9 @@ def _make(namespace: argparse.Namespace) -> int:
     if target.exists():
         raise existing_file(target)
     words = (*given.remove, *names_of_this_computer())
-    made = make_evidence(log, statement_of(given), words, serial_key=_key(namespace.serial_key))
+    key = _key(namespace.serial_key)
+    with working("making the archive …"):
+        made = make_evidence(log, statement_of(given), words, serial_key=key)
     try:
         with target.open("xb") as file:
             file.write(made.archive)
@@ -98,6 +101,7 @@ def _key(path: Path | None) -> bytes:
 
 def _check(namespace: argparse.Namespace) -> int:
     from tdhil.evidence import check_evidence, flag_of
+    from tdhil.report import working
 
     path: Path = namespace.check
     if namespace.log is not None or namespace.output is not None:
@@ -116,7 +120,8 @@ def _check(namespace: argparse.Namespace) -> int:
     except OSError as error:
         raise UsageError(f"can't be read ({error.strerror or error})", where=str(path),
                          entry=MessageCode.FILE_NOT_FOUND) from error
-    found = check_evidence(archive, digest)
+    with working("checking the archive …"):
+        found = check_evidence(archive, digest)
     _show(found, path)
     return int(ExitCode.NOT_PASSED if found.problems else ExitCode.OK)
 

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Print the responses. Exit 0: every log has one; 3: a log is not complete; 9: a log has no response."""
     from tdhil.api import identify
-    from tdhil.report import SIMULATED, PlainConsole, print_responses, save_responses, stderr_console
+    from tdhil.report import SIMULATED, PlainConsole, print_responses, save_responses, stderr_console, working
 
     logs: list[Path] = list(namespace.logs)
     while namespace.columns and "=" not in namespace.columns[-1]:
@@ -68,7 +68,8 @@ def run(namespace: argparse.Namespace) -> int:
         recorded.require_motion()
         for problem in recorded.problems:
             stderr_console().print(f"tdhil: {path}: {problem}", style="yellow", markup=False, soft_wrap=True)
-        found.append(identify(recorded, **settings))
+        with working("identifying …"):
+            found.append(identify(recorded, **settings))
     responses = [_part(one) for one in found]
     if namespace.out is not None:
         _write_table(found, namespace.out)

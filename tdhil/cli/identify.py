@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,7 +95,7 @@ def run_with(
     Raises TdhilError before the drive is accessed; after that every error becomes an exit code.
     """
     from tdhil.cli.dry_run import dry_run, dry_run_case, say_before
-    from tdhil.report import stderr_console
+    from tdhil.report import stderr_console, working
     from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
@@ -124,7 +123,7 @@ def run_with(
         real_time_priority=bool(details.real_time_priority), case=case, expect=details.expect,
     )
     if case is None:
-        with console.status("planning …") if console.is_terminal else nullcontext():
+        with working("planning …", console):
             said = say_before(options, rig, connection.profile, simulated)
         if said is not None:
             console.print(said, style="yellow", markup=False)
@@ -164,6 +163,7 @@ def _finish(
     session: RunSession, ending: Ending, options: RunOptions, console: Console, report: ReportFile | None,
 ) -> int:
     from tdhil.cli.results import print_result, save_report
+    from tdhil.report import working
 
     try:
         outcome = session.move(ending.request)
@@ -171,7 +171,7 @@ def _finish(
         if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
             code = _failed(outcome, str(session.path), options.json, console, session.rehearsal)
         else:
-            with console.status("identifying …") if console.is_terminal else nullcontext():
+            with working("identifying …", console):
                 found = session.conclude()
             document, code = found.document, int(found.exit_code)
     except BaseException:

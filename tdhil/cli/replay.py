@@ -98,6 +98,8 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
     """Return the content of a log, or of a trace by its options. Raises UsageError for options of a trace with a
     log.
     """
+    from tdhil.report import working
+
     trace: dict[str, Any] = {}
     if is_log(path):
         for option in OF_A_TRACE:
@@ -107,21 +109,23 @@ def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
     else:
         given = {option.name: getattr(namespace, option.name) for option in OF_A_TRACE}
         trace = trace_arguments(given, "the command line")
-    return read(path, **trace)
+    with working("reading the record …"):
+        return read(path, **trace)
 
 
 def _identify(namespace: argparse.Namespace, recorded: RunRecord, report: ReportFile | None) -> int:
     """Identify and print. Return the exit code of the result, or the one for a result from a part of the run."""
     from tdhil.api import identify
-    from tdhil.report import stderr_console
+    from tdhil.report import stderr_console, working
 
     if namespace.torque_calibration is not None:
         path = namespace.torque_calibration
         changed = with_calibration(recorded.configuration, recorded.recording, load_calibration(path), str(path),
                                    sha256_of(Path(recorded.log)))
         recorded = replace(recorded, configuration=changed)
-    result = identify(recorded, **settings_in(namespace))
     console = stderr_console()
+    with working("identifying …", console):
+        result = identify(recorded, **settings_in(namespace))
     for problem in recorded.problems:
         console.print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
     try:

@@ -58,6 +58,7 @@ def run(namespace: argparse.Namespace) -> int:
         rehearsed_faults,
         severity_document,
         severity_report,
+        working,
     )
     from tdhil.session import require_file
     from tdhil.soft_torque import SeverityRefused, bit_noise_in, severity
@@ -65,7 +66,8 @@ def run(namespace: argparse.Namespace) -> int:
     check_trace(namespace)
     paths = [namespace.log] if namespace.against is None else [namespace.log, namespace.against]
     report = ReportFile.of_files(namespace, *paths)
-    result = read_result(namespace.result)
+    with working("reading the result …"):
+        result = read_result(namespace.result)
     ratio, inertia = _inertia(result, namespace)
     string = string_for(result, namespace, ratio).string
     expected = None if namespace.controller is None else _expected(namespace)
@@ -81,11 +83,12 @@ def run(namespace: argparse.Namespace) -> int:
         warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
         record, remarks = _surface(recorded.recording, result, namespace)
         warnings += remarks
-        found.append((severity(record, string, inertia, expected if path == paths[-1] else None), str(path)))
-        try:
-            noises.append(bit_noise_in(record, string, inertia))
-        except SeverityRefused as refused:     # a text states why the record does not determine the bit noise
-            noises.append(str(refused))
+        with working("computing the downhole speed …"):
+            found.append((severity(record, string, inertia, expected if path == paths[-1] else None), str(path)))
+            try:
+                noises.append(bit_noise_in(record, string, inertia))
+            except SeverityRefused as refused:     # a text states why the record does not determine the bit noise
+                noises.append(str(refused))
         simulated |= recorded.recording.simulated
         faults += rehearsed_faults(recorded.configuration)
         configurations.append(recorded.configuration)

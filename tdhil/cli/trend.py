@@ -89,7 +89,7 @@ def run(namespace: argparse.Namespace) -> int:
 def run_compare(namespace: argparse.Namespace) -> int:
     """Identify each log, and compare it with the first."""
     from tdhil.fleet import FleetSettings, compare_document, identified, is_archived
-    from tdhil.report import Column, Picture, ReportSection, Table, Text
+    from tdhil.report import Column, Picture, ReportSection, Table, Text, working
 
     if len(namespace.logs) < 2:
         raise UsageError(f"{len(namespace.logs)} log is named, and compare needs two or more",
@@ -104,7 +104,8 @@ def run_compare(namespace: argparse.Namespace) -> int:
     report = ReportFile.of_files(namespace, *namespace.logs)
     runs = []
     for log in namespace.logs:
-        runs.append(identified(log, settings))
+        with working("identifying …"):
+            runs.append(identified(log, settings))
         if not namespace.rehearsals and (faults := runs[-1].row.rehearsed_faults):
             raise UsageError(f"this run is a rehearsal of faults: {faults}", where=str(log),
                              next_step="Add --rehearsals, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)

@@ -94,6 +94,7 @@ def run(namespace: argparse.Namespace) -> int:
         require_extra,
         save_loop_picture,
         stderr_console,
+        working,
     )
     from tdhil.speed_loop import SpeedLoopCase, design_speed_loop
 
@@ -102,8 +103,9 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.plot is not None:
         require_extra("--plot")
         require_target("--plot", namespace.plot, [namespace.result], "the result")
-    result = read_result(namespace.result)       # a log is identified again, which takes seconds
-    measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
+    with working("reading the result …"):        # a log is identified again, which takes seconds
+        result = read_result(namespace.result)
+        measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
     lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)
     plant = plant_of(result, lags, dead_time, namespace.result)
     present, present_from = present_gains(namespace, measured, result)

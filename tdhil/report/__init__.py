@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     )
     from tdhil.report.console import (
         PlainConsole as PlainConsole, names_and_texts as names_and_texts, stderr_console as stderr_console,
+        working as working,
     )
     from tdhil.report.document import (
         SIMULATED as SIMULATED, marks as marks, rehearsal_of as rehearsal_of, rehearsed_faults as rehearsed_faults,
@@ -83,7 +84,7 @@ else:
         "acceptance": "AcceptanceVerdict acceptance_of",
         "blocks": "Column Picture Report ReportSection Table Text reference_of shown_date",
         "card": "card_html card_text inertia_text minutes print_card",
-        "console": "PlainConsole names_and_texts stderr_console",
+        "console": "PlainConsole names_and_texts stderr_console working",
         "document": "SIMULATED marks rehearsal_of rehearsed_faults result_document run_facts text_of",
         "verification": "print_verification verification_document verification_report write_verification_report",
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",

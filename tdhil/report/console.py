@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from typing import TextIO
 
 from rich.box import SIMPLE_HEAD
@@ -36,6 +37,12 @@ class PlainConsole(Console):
 def stderr_console() -> Console:
     """Return the console for progress and messages. stdout is for results."""
     return PlainConsole(sys.stderr)
+
+
+def working(text: str, console: Console | None = None) -> AbstractContextManager[object]:
+    """Return a context with a moving sign beside a constant text at a terminal, and without output elsewhere."""
+    console = console or stderr_console()
+    return console.status(text) if console.is_terminal else nullcontext()
 
 
 def names_and_texts(rows: Iterable[tuple[str, RenderableType]], *, quiet: bool = False) -> Table:
