@@ -18,7 +18,7 @@ def save_report(
     document: Mapping[str, Any], recording: Recording, report: ReportFile | None,
     virtual_string: FloatArray | None = None,
 ) -> None:
-    """Write the report if requested. Raises UsageError if it can't be written.
+    """Write the report if requested, and print its path on stderr. Raises UsageError if it can't be written.
 
     ``virtual_string``: its cycles, if the run has one.
     """
@@ -37,7 +37,8 @@ def save_report(
 
             written = write_report(document, recording, path, head)
         if written != path:
-            print(f"tdhil: {path} was created by another program meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
+            print(f"tdhil: {path} was created by another program meanwhile", file=sys.stderr)  # noqa: T201
+        print(f"report: {written}", file=sys.stderr)  # noqa: T201
 
 
 def print_json(document: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from rich import box
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from profiles.quantities import printed_interval
+from profiles.quantities import printed_ends, printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table
 from tdhil.report.card import minutes
 from tdhil.report.console import PlainConsole, names_and_texts
@@ -131,8 +131,8 @@ def _figures(records: Sequence[Part]) -> list[str]:
 
 
 def _with(part: Part, digits: int, unit: str = "", sign: str = "") -> str:
-    return (f"{sign}{part['value']:.{digits}f}{unit} ({sign}{part['low']:.{digits}f} to "
-            f"{sign}{part['high']:.{digits}f})")
+    low, high = printed_ends(part["low"], part["high"], digits)
+    return f"{sign}{part['value']:.{digits}f}{unit} ({sign}{low} to {sign}{high})"
 
 
 def _rows(records: Sequence[Part]) -> Iterator[tuple[str, list[str]]]:

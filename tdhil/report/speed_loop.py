@@ -14,6 +14,7 @@ import numpy as np
 from rich.text import Text as Words
 
 from profiles import CodedText, MessageCode, entry_of, with_code
+from profiles.quantities import printed_interval
 from tdhil.errors import UsageError
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
@@ -271,8 +272,8 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     dead = plant["dead_time_s"]
     lags = " + ".join(f"{1e3 * lag['value']:.3g}" for lag in plant["lags_s"])
     together = [1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high")]
-    yield "lags in the loop", (f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together {together[0]:.3g} to "
-                               f"{together[1]:.3g} ms; {plant['lags_from']}")
+    yield "lags in the loop", (f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together "
+                               f"{printed_interval(*together, 3)} ms; {plant['lags_from']}")
     if document["tuned_for"]["present_from"] is not None:
         yield "present gains", document["tuned_for"]["present_from"]
     required = document["required"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,15 @@ def test_one_record(bench, capsys):
     # ω_b = τ/ζ sin ΩT, by hand
     assert found["downhole_swing_rpm"]["value"] == pytest.approx(
         5600.0 / 296.5 * np.sin(2.0 * np.pi / 8.16 * 0.944) * 30.0 / np.pi, rel=0.05)
+
+
+def test_the_printed_intervals_contain_those_of_the_document(bench, capsys):
+    (found,) = json.loads(ran(bench, capsys, "--json")[1])["records"]
+    card = " ".join(ran(bench, capsys)[1].split())
+    for name, key in (("severity index", "severity_index"), ("downhole speed", "downhole_swing_rpm"),
+                      ("string torque", "string_torque_swing_nm"), ("oscillation every", "period_s")):
+        (ends,) = re.findall(rf"{name} [^(]*\(±?([\d.]+) to ±?([\d.]+)\)", card)
+        assert float(ends[0]) <= found[key]["low"] <= found[key]["high"] <= float(ends[1]), name
 
 
 def test_j_of_a_rehearsal_marks_what_is_computed_from_it(bench, capsys):

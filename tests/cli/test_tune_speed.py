@@ -80,6 +80,11 @@ def test_the_terminal_fits_80_columns_and_says_what_to_type(tuned):
     assert max(map(len, text.splitlines())) <= 80
 
 
+def test_the_interval_of_the_lags_is_rounded_outwards(tuned):
+    _, text, _ = tuned("--inner-lags", "20ms", "10.04ms", "--dead-time", "3ms", as_json=False)
+    assert "together 29.7 to 36.4 ms" in " ".join(text.split())          # ±10 %: 29.736 to 36.344 ms
+
+
 def test_a_rehearsal_is_marked(tuned):
     code, text, _ = tuned(simulated=True, rehearsed_faults=["torque-scale=1.1"], as_json=False)
     assert code == 0 and "speed loop of the drive · SIMULATED · FAULT REHEARSAL" in " ".join(text.split())

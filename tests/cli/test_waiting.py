@@ -38,6 +38,12 @@ def test_at_a_terminal_a_sign_moves_while_a_log_is_identified(logs, command, sig
     assert sign in out.getvalue() and out.getvalue().count("\x1b[?25l") == out.getvalue().count("\x1b[?25h")
 
 
+def test_the_path_of_the_report_is_printed(logs, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    main(["replay", str(logs["log"]), "--json", "--report", str(tmp_path / "r.html")])
+    assert capsys.readouterr().err.endswith(f"report: {tmp_path / 'r.html'}\n") and (tmp_path / "r.html").exists()
+
+
 def test_elsewhere_nothing_is_printed():
     out = io.StringIO()
     with working("identifying …", Console(file=out, force_terminal=False)):
