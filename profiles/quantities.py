@@ -172,6 +172,13 @@ def printed_ends(low: float, high: float, decimals: int) -> tuple[str, str]:
     return found[0], found[1]
 
 
+def printed_bound(value: float, digits: int, *, up: bool = False) -> str:
+    """Return a positive number with some significant digits, rounded down, or up: 4.97 Hz is no bandwidth of 5 Hz."""
+    if not 0.0 < value < math.inf:
+        return f"{value:.{digits}g}"
+    return printed_ends(value, value, digits - 1 - math.floor(math.log10(value)))[up]
+
+
 def printed_share(share: float) -> str:
     """Return ``±0.80 %`` for 0.008, the half-width of an interval as a share: two significant digits, rounded up."""
     if not math.isfinite(share):

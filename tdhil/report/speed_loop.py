@@ -52,8 +52,9 @@ _UNLIKE = 3.0
 """Half-widths by which a measured line may differ from the shaft used for the tuning."""
 _UNLIKE_REL = 0.1
 """Relative difference below which no line is named in a warning."""
-_BEYOND_LINES = 1.0
-"""Bandwidth over the highest excited frequency, from which a warning follows."""
+_BEYOND_LINES = 1.01
+"""Bandwidth over the highest excited frequency, from which a warning follows. The rounded bandwidth of its advice stays
+below."""
 _EXPLAINED = {
     "P, I": "gains at the motor shaft, N·m·s/rad and N·m/rad",
     "margins": "of the open loop: best estimate, and the least over all corners of the intervals",
@@ -174,7 +175,7 @@ def _warnings(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTu
         yield CodedText(
             f"The bandwidth of {bandwidth:.3g} Hz is above the highest excited frequency of {highest:.3g} Hz. A "
             "resonance in between was not measured. Identify with a higher --frequency, or request --bandwidth "
-            f"{highest:.2g}.", MessageCode.LOOP_BEYOND_RESPONSE)
+            f"{highest:.3g}.", MessageCode.LOOP_BEYOND_RESPONSE)
     off = deviation_from_model(design, shaft)
     unlike = (off > _UNLIKE * shaft.half_rel) & (off > _UNLIKE_REL)
     if np.any(unlike):
@@ -271,9 +272,9 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
         yield "resonance", part_with_interval(plant["resonance_hz"], "Hz")
     dead = plant["dead_time_s"]
     lags = " + ".join(f"{1e3 * lag['value']:.3g}" for lag in plant["lags_s"])
-    together = [1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high")]
+    low, high = (1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high"))
     yield "lags in the loop", (f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together "
-                               f"{printed_interval(*together, 3)} ms; {plant['lags_from']}")
+                               f"{printed_interval(low, high, 3)} ms; {plant['lags_from']}")
     if document["tuned_for"]["present_from"] is not None:
         yield "present gains", document["tuned_for"]["present_from"]
     required = document["required"]

@@ -20,6 +20,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from profiles import MessageCode, TdhilError
+from profiles.quantities import printed_bound
 from tdhil.speed_loop.loop import (
     Complexes,
     LoopPlant,
@@ -271,11 +272,12 @@ def design_speed_loop(case: SpeedLoopCase) -> LoopDesign:
         if not search.fits(found):
             worst = worst_of(search.margins(found))
             what = ("the loop is unstable or conditionally stable at a corner of the intervals" if not worst.stable
-                    or worst.conditional else f"the worst case has {worst.phase_deg:.0f}° and {worst.gain_db:.1f} dB")
+                    or worst.conditional else f"the worst case has {printed_bound(worst.phase_deg, 3)}° and "
+                    f"{printed_bound(worst.gain_db, 3)} dB")
             raise LoopTuningRefused(
                 f"a bandwidth of {hertz:g} Hz leaves too little margin: {what} (limits {case.phase_deg:g}° and "
                 f"{case.gain_db:g} dB). The largest bandwidth that fits is {search.bandwidth_hz(largest):.3g} Hz",
-                next_step=f"Request --bandwidth {search.bandwidth_hz(largest):.2g} or less")
+                next_step=f"Request --bandwidth {printed_bound(search.bandwidth_hz(largest), 2)} or less")
     if not all(is_stable_loop(plant, found) for plant in (search.believed, *search.corners)):
         raise LoopTuningRefused("the poles of the tuned loop contradict its margins",
                                 next_step="Request a lower --bandwidth")

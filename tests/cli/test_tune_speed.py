@@ -80,6 +80,19 @@ def test_the_terminal_fits_80_columns_and_says_what_to_type(tuned):
     assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.parametrize("hertz", [1.0, 0.6, 0.8556, 1.0049])
+def test_the_bandwidth_that_the_warning_advises_ends_it(tuned, hertz):
+    """The bandwidth that is found is the requested one within rounding, such as 0.6000000000000127 Hz."""
+    lines = response()["lines"]
+    lines[-1]["hertz"] = hertz
+    words, said = ("--inner-lags", "20ms", "10ms", "--dead-time", "3ms"), {"frequency_response": {"lines": lines}}
+    _, first, _ = tuned(*words, **said)
+    (warning,) = (text for text in first["warnings"] if "highest excited frequency" in text)
+    (advised,) = re.findall(r"request --bandwidth ([\d.]+)\.$", warning)
+    _, second, _ = tuned(*words, "--bandwidth", advised, **said)
+    assert "TDH-055" in first["warning_codes"] and "TDH-055" not in second["warning_codes"]
+
+
 def test_the_interval_of_the_lags_is_rounded_outwards(tuned):
     _, text, _ = tuned("--inner-lags", "20ms", "10.04ms", "--dead-time", "3ms", as_json=False)
     assert "together 29.7 to 36.4 ms" in " ".join(text.split())          # ±10 %: 29.736 to 36.344 ms

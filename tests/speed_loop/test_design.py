@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -80,6 +81,26 @@ def test_a_requested_bandwidth_is_met_or_refused_with_the_largest_that_fits():
     assert design.tuned.bandwidth_hz.value == pytest.approx(1.0, rel=1e-6)
     with pytest.raises(LoopTuningRefused, match=r"bandwidth of 10 Hz .* The largest bandwidth that fits is 4\.75 Hz"):
         design_speed_loop(SpeedLoopCase(RIGID, bandwidth_hz=10.0))
+
+
+@pytest.mark.parametrize("largest_hz", [4.97, 10.7])
+def test_the_bandwidth_that_the_refusal_advises_fits(largest_hz):
+    """The largest one, 4.97 Hz, was rounded to 5 Hz in the advice, which is refused again."""
+    scale = design_speed_loop(SpeedLoopCase(RIGID)).tuned.bandwidth_hz.value / largest_hz
+
+    def scaled(one):
+        return Range(scale * one.value, scale * one.low, scale * one.high)
+
+    viscous = RIGID.viscous_nm_s_rad
+    plant = replace(RIGID, lags_s=tuple(map(scaled, RIGID.lags_s)), dead_time_s=scaled(RIGID.dead_time_s),
+                    viscous_nm_s_rad=Range(viscous.value / scale, viscous.low / scale, viscous.high / scale))
+    with pytest.raises(LoopTuningRefused) as refused:
+        design_speed_loop(SpeedLoopCase(plant, bandwidth_hz=1.01 * largest_hz))
+    text = str(refused.value)
+    (advised,) = re.findall(r"Request --bandwidth ([\d.]+) or less", text)
+    (worst,) = re.findall(r"worst case has ([\d.]+)° and", text)
+    assert float(advised) <= largest_hz and float(worst) < 45.0
+    assert design_speed_loop(SpeedLoopCase(plant, bandwidth_hz=float(advised))).tuned.worst.phase_deg >= 45.0
 
 
 def test_lags_that_may_be_zero_still_have_a_worst_case():
