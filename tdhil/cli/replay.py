@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from profiles.quantities import SHARE
 from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_result, save_report
@@ -155,5 +156,7 @@ def check_trace(namespace: argparse.Namespace) -> None:
     for option in OF_A_TRACE:
         value = getattr(namespace, option.name)
         if option.kind is float and value is not None and (wanted := option.refusal(value)):
-            raise UsageError(f"{value:g}: must be {wanted}", where=option.flag, entry=MessageCode.VALUE_NOT_ALLOWED)
+            symbol = "" if option.unit in (None, SHARE) else f" {option.unit.symbol}"
+            raise UsageError(f"{value:g}{symbol}: must be {wanted}{symbol}", where=option.flag,
+                             entry=MessageCode.VALUE_NOT_ALLOWED)
     check_lags({option.name: getattr(namespace, option.name) for option in OF_A_TRACE})

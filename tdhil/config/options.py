@@ -624,9 +624,9 @@ class TraceOptions(_Said):
         help="relative standard uncertainty of the torque scale (default {default})",
     )
     speed_lag_s: float | None = option(
-        "--speed-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True,
+        "--speed-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=60, api=True,
         form=Form("Filter on the reported speed, s", ("trace",), hint="unknown"),
-        help="time constant of the filter on the reported speed",
+        help="time constant of the filter on the reported speed, such as 0.4 or 400ms",
     )
     speed_lag_sd_s: float | None = option(
         "--speed-lag-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a tenth of it",
@@ -634,9 +634,9 @@ class TraceOptions(_Said):
         help="its standard uncertainty (default {default})",
     )
     torque_lag_s: float | None = option(
-        "--torque-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True,
+        "--torque-lag", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=60, api=True,
         form=Form("Filter on the reported torque, s", ("trace",), hint="unknown"),
-        help="time constant of the filter on the reported torque",
+        help="time constant of the filter on the reported torque, such as 0.15 or 150ms",
     )
     torque_lag_sd_s: float | None = option(
         "--torque-lag-sd", group=Topic.TRACE, unit=TIME, metavar="S", ge=0, lt=1e6, api=True, unset="a tenth of it",

@@ -193,6 +193,7 @@ def test_a_log_is_known_by_its_content(run, tmp_path):
     (("--tolerance", "0"), "--tolerance"),
     (("--torque-scale-sd", "2"), "--torque-scale-sd"),
     (("--speed-lag", "-1"), "--speed-lag"),
+    (("--speed-lag", "400"), "--speed-lag: 400 s: must be at least 0 and less than 60 s"),        # 400 ms were meant
     (("--torque-lag-sd", "0.1"), "--torque-lag"),
     (("--excitation", "none.yaml"), "none.yaml"),
 ])
