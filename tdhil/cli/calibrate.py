@@ -212,7 +212,7 @@ def _plan(namespace: argparse.Namespace) -> int:
 
     table = Table(title=f"J {inertia:.4g} kg·m² in the drive's unit; stage 5 took {minutes:.1f} min", box=None,
                   title_justify="left", padding=(0, 3))
-    wanted = f"minutes each for ±{100 * namespace.want:.2f} %"
+    wanted = f"minutes each\nfor ±{100 * namespace.want:.4g} %"
     for name in (f"body, kg·m² ({namespace.at})", "J after two such runs", wanted):
         table.add_column(name, justify="right")
     for one in plans:

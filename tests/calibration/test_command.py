@@ -2,6 +2,7 @@
 
 import pytest
 
+from tdhil.calibration import plan_bodies
 from tdhil.cli.main import main
 
 TRACE = "time_s,speed_rad_s,torque_nm\n" + "".join(f"{0.01 * k:.2f},4.0,90.{k % 10}\n" for k in range(300))
@@ -39,6 +40,14 @@ def test_a_log_that_is_not_there_or_the_same_twice_ends_with_2(traces, tmp_path)
 def test_a_plan_is_for_a_body_and_says_so(traces, capsys, option):
     assert main(["calibrate", "torque", traces[0], "--plan", option, "file"]) == 2
     assert option in capsys.readouterr().err
+
+
+def test_the_table_of_a_plan_keeps_each_value_with_its_unit_in_80_columns(traces, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("tdhil.session.find_plan", lambda *_: (109.8, 3.7, plan_bodies(109.8, 0.002, 3.7, 0.01, 0.001)))
+    assert main(["calibrate", "torque", traces[0], "--plan", "--want", "0.5%"]) == 0
+    _, above, head, *rows = capsys.readouterr().out.splitlines()
+    assert above.strip() == "minutes each" and head.rstrip().endswith("for ±0.5 %") and len(rows) == 8
 
 
 def test_nothing_is_written_over(traces, tmp_path):
