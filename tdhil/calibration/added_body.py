@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from profiles.quantities import printed_share
+from profiles.quantities import printed_bound, printed_share
 from tdhil.estimation import ResidualTest, Verdict
 from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
 from tdhil.recording import FloatArray
@@ -180,7 +180,8 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
                   f"±{100 * assumed:.1f} %")
         advice = "measure for longer, and state how well the body's inertia is known (--added-sd)"
         if least is not None:
-            advice = f"use a body of {least:.3g} kg·m² or more at the motor, or measure for longer"
+            body = printed_bound(least, 3, up=True)
+            advice = f"use a body of {body} kg·m² or more at the motor, or measure for longer"
         return replace(refused, reason=reason, advice=advice, least_added_kg_m2=least)
     # the uncertainty of the factor itself is added to the allowed error
     most = max(LARGEST_ERROR, LARGEST_IN_SD * case.scale_rel_sd) + student_quantile(case.confidence, CERTAIN) * (

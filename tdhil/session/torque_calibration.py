@@ -133,8 +133,9 @@ def find_plan(
     try:
         alone = identify_together([record.recording])
     except Refused as refused:
+        advice = refused.refusal.advice
         raise UsageError(f"gives no plan: {refused.refusal.reason}", where=record.log,
-                         next_step=refused.refusal.advice) from None
+                         next_step=advice[:1].upper() + advice[1:]) from None
     value = float(alone.inertia_kg_m2[0])
     excitation = record.recording.excitation
     segments = () if excitation is None else excitation.segments

@@ -42,6 +42,11 @@ def test_a_plan_is_for_a_body_and_says_so(traces, capsys, option):
     assert option in capsys.readouterr().err
 
 
+def test_a_log_without_a_periodic_motion_gives_no_plan(traces, capsys):
+    assert main(["calibrate", "torque", traces[0], "--plan"]) == 2
+    assert "gives no plan: there is no periodic excitation in it. Identify with a multisine" in capsys.readouterr().err
+
+
 def test_the_table_of_a_plan_keeps_each_value_with_its_unit_in_80_columns(traces, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("tdhil.session.find_plan", lambda *_: (109.8, 3.7, plan_bodies(109.8, 0.002, 3.7, 0.01, 0.001)))
