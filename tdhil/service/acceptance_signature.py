@@ -45,14 +45,6 @@ class AcceptanceSignature:
         return ""
 
 
-def signature_in(plain: Mapping[str, Any] | None) -> AcceptanceSignature | None:
-    """Return the signature in a file's content; None without one."""
-    try:
-        return None if plain is None else AcceptanceSignature(**plain)
-    except TypeError:
-        return None
-
-
 def hash_of(acceptance: Mapping[str, Any]) -> str:
     """Return the SHA-256 of an acceptance, in hex. The order of its keys does not matter."""
     return hashlib.sha256(json.dumps(acceptance, sort_keys=True).encode()).hexdigest()

@@ -144,9 +144,7 @@ class Client:
         """Stop the rig's present run. Without a run, stop the rig's drive, as ``tdhil stop`` does."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/stop", {})
 
-    def annotate(
-        self, run: str, *, tags: Sequence[str] | None = None, **texts: str | None
-    ) -> dict[str, Any]:
+    def annotate(self, run: str, *, tags: Sequence[str] | None = None, **texts: str | None) -> dict[str, Any]:
         """Edit tags and texts (``operator``, ``note``, ``customer``, ``order_number``, ``place``) of an ended run.
 
         None leaves a value. The log stays as it is.

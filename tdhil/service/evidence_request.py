@@ -11,8 +11,9 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from tdhil.config import OF_EVIDENCE, EvidenceOptions
-from tdhil.errors import MessageCode, UsageError
-from tdhil.service.start_request import ValuesWrong, value_of
+from tdhil.errors import UsageError
+from tdhil.service.run_state import request_wrong
+from tdhil.service.start_request import require_right, value_of
 
 ARCHIVE: Final = "evidence.zip"
 ABOUT: Final = "evidence.json"
@@ -36,14 +37,6 @@ class EvidenceView:
     at: str
 
 
-def evidence_in(plain: Mapping[str, Any] | None) -> EvidenceView | None:
-    """Return the view in a file's content; None without one."""
-    try:
-        return None if plain is None else EvidenceView(**plain)
-    except TypeError:
-        return None
-
-
 def stated_in(body: Mapping[str, Any]) -> EvidenceOptions:
     """Return the statement of a request. Raises ValuesWrong with all that is wrong or missing, and UsageError for an
     unknown key.
@@ -55,8 +48,7 @@ def stated_in(body: Mapping[str, Any]) -> EvidenceOptions:
     for name, value in body.items():
         option = STATEMENT.get(str(name))
         if option is None:
-            raise UsageError("is not a part of the statement", where=str(name)[:60],
-                             next_step=f"Parts: {', '.join(STATEMENT)}", entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("is not a part of the statement", str(name)[:60], f"Parts: {', '.join(STATEMENT)}")
         if value in (None, "", []):
             continue
         try:
@@ -67,6 +59,5 @@ def stated_in(body: Mapping[str, Any]) -> EvidenceOptions:
         given[option.keyword] = tuple(found) if option.joined else found
     refused = {name for name, _ in wrong}
     wrong += [(name, why) for name, why in wrong_in(EvidenceOptions(**given)) if name not in refused]
-    if wrong:
-        raise ValuesWrong(wrong)
+    require_right(wrong)
     return EvidenceOptions(**given)

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.responses import FileResponse, Response
 
-from tdhil.errors import MessageCode, UsageError
 from tdhil.service.access import principal
 from tdhil.service.fleets import TABLE, FleetView
 from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import apis
 from tdhil.service.run_routes import settings_of
+from tdhil.service.run_state import request_wrong
 from tdhil.service.schemas import FleetBody
 
 if TYPE_CHECKING:
@@ -63,9 +63,9 @@ async def fleet_rows(site: Site, request: Request, body: None) -> list[dict[str,
     query = request.query_params
     start, limit = query.get("from", "0"), query.get("limit", "200")
     if not start.isdecimal() or len(start) > 9:
-        raise UsageError("must be a number", where="from", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be a number", "from")
     if whole_number(limit, 1, 1000) is None:
-        raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be 1 to 1000", "limit")
     return await off(lambda: site.fleets.rows(request.path_params["fleet"], int(start), int(limit)))
 
 

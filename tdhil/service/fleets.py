@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from tdhil.errors import MessageCode, UsageError
 from tdhil.numerics import prepare
-from tdhil.service.run_state import Conflict, NotThere, Told, now
+from tdhil.service.run_state import Conflict, NotThere, Told, now, request_wrong
 from tdhil.service.store import Store, read_json, write_json
 
 if TYPE_CHECKING:
@@ -177,15 +177,13 @@ class Fleets:
     def _check(self, folder: str, below: str) -> None:
         if folder not in self.folders:
             there = ", ".join(filter(None, self.folders)) or "none"
-            raise UsageError("is not a folder of this service", where=folder[:60],
-                             next_step=f"Folders: {there}. Add one with tdhil serve --logs DIR",
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("is not a folder of this service", folder[:60],
+                                f"Folders: {there}. Add one with tdhil serve --logs DIR")
         root = self.folders[folder].resolve()
         if folder == RUNS:
             root = self._runs
             if below:
-                raise UsageError("the service's runs can only be used all together", where="below",
-                                 next_step="Remove it", entry=MessageCode.REQUEST_WRONG)
+                raise request_wrong("the service's runs can only be used all together", "below", "Remove it")
             if next(root.glob("*/run.mcap"), None) is None:
                 raise UsageError("no run has a log yet", where=root.name, next_step="Start a run",
                                  entry=MessageCode.NOT_READY)
@@ -196,8 +194,7 @@ class Fleets:
         except (OSError, ValueError):
             found = False
         if not found:
-            raise UsageError("is not a folder inside it", where=f"below {below[:60]}",
-                             next_step="Name a folder inside it", entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("is not a folder inside it", f"below {below[:60]}", "Name a folder inside it")
 
     def _view(self, fleet: str) -> FleetView | None:
         going = self._going

@@ -122,8 +122,6 @@ class Relay:
             await self._say({"op": "removeStatus", "statusIds": [_WAITS]})
             await self._introduce(running)
 
-    # -- requests of the viewer --------------------------------------------------------------------------------------
-
     # -- messages to the viewer --------------------------------------------------------------------------------------
 
     async def _introduce(self, running: Running | None) -> None:

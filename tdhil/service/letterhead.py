@@ -14,7 +14,7 @@ from tdhil.fleet import ANNOTATIONS_FILE
 from tdhil.report import LONGEST_LINE, MOST_LINES, NO_LETTERHEAD, Letterhead, clean_logo
 from tdhil.service.annotations import Annotations, one_line
 from tdhil.service.audit import Audit
-from tdhil.service.start_request import ValuesWrong
+from tdhil.service.start_request import require_right
 from tdhil.service.store import Store, read_json, write_json
 
 FILE: Final = "letterhead.json"
@@ -49,8 +49,7 @@ def change_letterhead(
             wrong.append(("logo", f"{error.what}. {error.next_step}"))
         except ValueError:
             wrong.append(("logo", "must be a PNG in base64"))
-    if wrong:
-        raise ValuesWrong(wrong)
+    require_right(wrong)
     found = Letterhead(company, lines, picture)
     try:
         audit.note(who, "letterhead changed", run=None, rig=None, company=company, address=list(lines),

@@ -103,9 +103,7 @@ class LivePicture:
 
 def columns(samples: np.ndarray[Any, Any]) -> list[list[float | None]]:
     """Return [time], [speed], [torque], rounded for display; None for a value that is not finite."""
-    return [
-        [round(value, 5) if math.isfinite(value) else None for value in column] for column in samples.T.tolist()
-    ]
+    return [[round(value, 5) if math.isfinite(value) else None for value in column] for column in samples.T.tolist()]
 
 
 class Feed:

@@ -20,8 +20,8 @@ from urllib.parse import unquote, urlsplit
 
 from profiles import visible
 from profiles.quantities import printed_interval
-from tdhil.errors import MessageCode, UsageError
 from tdhil.service.password_file import read_password
+from tdhil.service.run_state import option_wrong
 
 TIMEOUT_S: Final = 20.0
 """Longest wait for each reply of the server, s."""
@@ -67,17 +67,14 @@ class Mail:
         recipients = tuple(unquote(one).strip() for one in parts.path.strip("/").split(","))
         wrong = [one for one in recipients if not _ADDRESS.fullmatch(one)]
         if parts.scheme not in ("smtp", "smtps") or not host or port == 0 or wrong or parts.query or parts.fragment:
-            raise UsageError("must be smtp:// or smtps://, a host, and the recipients after a slash", where="--mail",
-                             next_step="Use smtp://mail.example/chief@example.com,driller@example.com",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("must be smtp:// or smtps://, a host, and the recipients after a slash", "--mail",
+                               "Use smtp://mail.example/chief@example.com,driller@example.com")
         if parts.password is not None:
-            raise UsageError("a password must not be in the address", where="--mail",
-                             next_step=f"Put it into a file, and name the file in {PASSWORD_FILE}",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("a password must not be in the address", "--mail",
+                               f"Put it into a file, and name the file in {PASSWORD_FILE}")
         sender = environment.get(SENDER) or f"tdhil@{socket.getfqdn()}"
         if not _ADDRESS.fullmatch(sender):
-            raise UsageError("must be one address", where=f"{SENDER} {sender[:60]!r}",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("must be one address", f"{SENDER} {sender[:60]!r}")
         encrypted = parts.scheme == "smtps"
         return Mail(host, port or (465 if encrypted else 25), recipients, sender,
                     unquote(user) if user else None, encrypted,

@@ -34,6 +34,7 @@ from tdhil.service.run_state import (
     TooManyTries,
     TooSlow,
     disk_full,
+    request_wrong,
 )
 from tdhil.service.schemas import FILE, OBJECTS, ErrorView, FieldError, Route, adapter, plain
 from tdhil.service.start_request import ValuesWrong
@@ -163,22 +164,19 @@ async def body_of(request: Request, route: Route) -> Any:
     async for piece in request.stream():
         data += piece
         if len(data) > route.longest:
-            raise UsageError(f"the body is longer than the limit of {route.longest} bytes", where="body",
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong(f"the body is longer than the limit of {route.longest} bytes", "body")
     media = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
     if media != "application/json":
-        raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Use application/json",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be JSON", f"content-type {media[:60]}", "Use application/json")
     try:
         sent = json.loads(data or b"{}", parse_constant=_no_number, parse_int=_whole)
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"is not JSON ({str(error)[:100]})", where="body", entry=MessageCode.REQUEST_WRONG) from None
+        raise request_wrong(f"is not JSON ({str(error)[:100]})", "body") from None
     if not isinstance(sent, dict):
-        raise UsageError("must be an object", where="body", next_step='Send an object, such as {"seed": 7}',
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be an object", "body", 'Send an object, such as {"seed": 7}')
     if (where := _not_text(sent)) is not None:
-        raise UsageError("contains half of a UTF-16 surrogate pair, not a character", where=where[:60] or "body",
-                         next_step="Nothing was changed. Enter the text again", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("contains half of a UTF-16 surrogate pair, not a character", where[:60] or "body",
+                            "Nothing was changed. Enter the text again")
     if route.body in OBJECTS:
         return sent
     try:
@@ -188,9 +186,8 @@ async def body_of(request: Request, route: Route) -> Any:
         where = ".".join(map(str, first["loc"]))[:60] or "body"
         if first["type"] == "unexpected_keyword_argument":
             known = ", ".join(one.name for one in fields(route.body))
-            raise UsageError("is not a field of this request", where=where, next_step=f"Fields: {known}",
-                             entry=MessageCode.REQUEST_WRONG) from None
-        raise UsageError(first["msg"], where=where, entry=MessageCode.REQUEST_WRONG) from None
+            raise request_wrong("is not a field of this request", where, f"Fields: {known}") from None
+        raise request_wrong(first["msg"], where) from None
 
 
 def _whole(text: str) -> int:

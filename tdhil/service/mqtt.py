@@ -25,6 +25,7 @@ from urllib.parse import unquote, urlsplit
 
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.password_file import read_password
+from tdhil.service.run_state import option_wrong
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -60,16 +61,13 @@ class Broker:
             parts = urlsplit(url)
             port, host = parts.port, parts.hostname
         except ValueError:
-            raise UsageError("is not a valid address", where="--mqtt", next_step="Use mqtt://host:1883/site",
-                             entry=MessageCode.SERVICE_OPTION_WRONG) from None
+            raise option_wrong("is not a valid address", "--mqtt", "Use mqtt://host:1883/site") from None
         if parts.password is not None:
-            raise UsageError("a password must not be on the command line, which every user can read", where="--mqtt",
-                             next_step=f"Put it into a file, and name the file in {PASSWORD_FILE}",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("a password must not be on the command line, which every user can read", "--mqtt",
+                               f"Put it into a file, and name the file in {PASSWORD_FILE}")
         if parts.scheme not in PORTS or not host or parts.query or parts.fragment:
-            raise UsageError("must be mqtt:// or mqtts://, a host, and optionally a port and a prefix",
-                             where="--mqtt", next_step="Use mqtt://host:1883/site",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("must be mqtt:// or mqtts://, a host, and optionally a port and a prefix", "--mqtt",
+                               "Use mqtt://host:1883/site")
         prefix = unquote(parts.path).strip("/") or "tdhil"
         if set(prefix) & set("+#\0") or prefix.startswith("$") or "//" in prefix:
             raise UsageError("a prefix must not contain +, # or //, nor begin with $", where=f"--mqtt …/{prefix}")
@@ -114,9 +112,8 @@ class Publisher:
             try:
                 found.tls_set(self._broker.ca_file)
             except (OSError, ssl.SSLError) as error:
-                raise UsageError(f"can't be read as certificates ({getattr(error, 'strerror', None) or error})",
-                                 where=f"{CA_FILE} {self._broker.ca_file}",
-                                 entry=MessageCode.SERVICE_OPTION_WRONG) from None
+                raise option_wrong(f"can't be read as certificates ({getattr(error, 'strerror', None) or error})",
+                                   f"{CA_FILE} {self._broker.ca_file}") from None
         found.on_connect = self._on_connect
         # paho gives no reason: an untrusted certificate causes the same call.
         why = "can't be reached" + (", or its certificate isn't trusted" if self._broker.tls else "")

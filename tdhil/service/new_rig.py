@@ -18,7 +18,8 @@ from drivers import CommunicationLost
 from profiles import DataFileError, Profile, load_profile, profile_names, unit_text
 from tdhil.buses import FoundDrive, bus_named
 from tdhil.config import Limits, Rig, parse_rig
-from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.errors import ExitCode
+from tdhil.service.run_state import request_wrong
 from tdhil.service.schemas import (
     DraftBody,
     DraftProblemView,
@@ -67,12 +68,12 @@ def draft_of(body: DraftBody) -> DraftView:
     """Return the text of the file, and every mistake with its field. Nothing is written. Raises UsageError."""
     profile = _profile(body.profile)
     if body.motion not in NEW_RIG_MOTIONS:
-        raise UsageError(f"must be {' or '.join(NEW_RIG_MOTIONS)}", where="motion", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong(f"must be {' or '.join(NEW_RIG_MOTIONS)}", "motion")
     if body.load not in ("none", "string"):
-        raise UsageError("must be none or string", where="load", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be none or string", "load")
     fields = {one.name for one in _address_fields(profile.bus)}
     if unknown := sorted(set(body.address) - fields):
-        raise UsageError(f"{unknown[0]}: not a key of this bus", where="address", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong(f"{unknown[0]}: not a key of this bus", "address")
     known = RigEntries(
         simulated=body.simulated, name=body.name.strip() or None,
         address={} if body.simulated else _given(body.address), limits=_given(body.limits, LIMIT_KEYS),
@@ -102,8 +103,7 @@ def draft_of(body: DraftBody) -> DraftView:
 def _profile(name: str) -> Profile:
     """Return a profile that ships. Raises UsageError: no path comes over HTTP."""
     if name not in profile_names():
-        raise UsageError("is not a profile of tdhil", where="profile", next_step="See the list of profiles",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("is not a profile of tdhil", "profile", "See the list of profiles")
     return load_profile(name)
 
 

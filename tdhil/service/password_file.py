@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from tdhil.errors import MessageCode, UsageError
+from tdhil.service.run_state import option_wrong
 
 
 def read_password(variable: str, environment: Mapping[str, str]) -> str | None:
@@ -15,7 +15,5 @@ def read_password(variable: str, environment: Mapping[str, str]) -> str | None:
     try:
         return Path(name).read_text(encoding="utf-8").rstrip("\r\n")
     except (OSError, ValueError) as error:
-        raise UsageError(f"can't be read ({getattr(error, 'strerror', None) or 'no text'})",
-                         where=f"{variable} {name}",
-                         next_step="The file must contain only the password, readable by its owner only",
-                         entry=MessageCode.SERVICE_OPTION_WRONG) from None
+        raise option_wrong(f"can't be read ({getattr(error, 'strerror', None) or 'no text'})", f"{variable} {name}",
+                           "The file must contain only the password, readable by its owner only") from None

@@ -15,20 +15,12 @@ from typing import Any
 
 from tdhil.errors import LogError, MessageCode
 from tdhil.file_hash import sha256_of
-from tdhil.service.acceptance_signature import (
-    FILE,
-    LONGEST_NAME,
-    LONGEST_REMARK,
-    PASS,
-    AcceptanceSignature,
-    hash_of,
-    signature_in,
-)
+from tdhil.service.acceptance_signature import FILE, LONGEST_NAME, LONGEST_REMARK, PASS, AcceptanceSignature, hash_of
 from tdhil.service.annotations import LONGEST_TEXT, one_line, tags_of
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import Conflict, State, now
-from tdhil.service.start_request import ValuesWrong
-from tdhil.service.store import LOG, read_json, write_json
+from tdhil.service.start_request import ValuesWrong, require_right
+from tdhil.service.store import LOG, read_as, read_json, write_json
 from tdhil.service.supervisor import Supervisor
 
 
@@ -41,9 +33,7 @@ class RunRecords:
         self._lock = threading.Lock()
         self._hashes: dict[str, tuple[tuple[int, int, int], str]] = {}
 
-    def annotate(
-        self, run: str, who: str, *, tags: Sequence[str] | None = None, **texts: str | None
-    ) -> None:
+    def annotate(self, run: str, who: str, *, tags: Sequence[str] | None = None, **texts: str | None) -> None:
         """Edit tags and texts (of `STATED`) of a run; None leaves a value. Raises NotThere, LogError, and ValuesWrong
         with all wrong values.
         """
@@ -59,8 +49,7 @@ class RunRecords:
                 wanted["tags"] = tags_of(tags)
             except ValueError as error:
                 wrong.append(("tags", str(error)))
-        if wrong:
-            raise ValuesWrong(wrong)
+        require_right(wrong)
         self._edit(run, who, **wanted)
 
     def archive(self, run: str, who: str, *, archived: bool) -> None:
@@ -111,7 +100,7 @@ class RunRecords:
 
     def signature(self, run: str) -> AcceptanceSignature | None:
         """Return the signature under the acceptance of a run; None without one. Raises NotThere."""
-        return signature_in(read_json(self._store.place(run) / FILE))
+        return read_as(AcceptanceSignature, self._store.place(run) / FILE)
 
     def acceptance(self, run: str) -> tuple[dict[str, Any], str]:
         """Return the present acceptance of a run, and the SHA-256 of its log. Raises NotThere, and Conflict without an
@@ -157,8 +146,7 @@ class RunRecords:
                 wrong.append(("remark", f"must be a text of at most {LONGEST_REMARK} characters"))
             if verdict != PASS and not remark:
                 wrong.append(("remark", f"a remark is needed, because the verdict is {verdict}"))
-            if wrong:
-                raise ValuesWrong(wrong)
+            require_right(wrong)
             signature = AcceptanceSignature(name, role, who, now(), remark, verdict, digest, hash_of(present))
             self._audit(who, "acceptance signed", run, request.rig, **asdict(signature))
             try:

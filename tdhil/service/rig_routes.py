@@ -12,7 +12,7 @@ from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import apis
 from tdhil.service.run_routes import asks_for
-from tdhil.service.run_state import Conflict, NotAllowed
+from tdhil.service.run_state import Conflict, NotAllowed, request_wrong
 from tdhil.service.schemas import (
     CalibrationBody,
     CalibrationView,
@@ -129,7 +129,7 @@ async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int
     """Request a run. The same key returns the same run."""
     key = request.headers.get("idempotency-key")
     if key is not None and not 1 <= len(key) <= 200:
-        raise UsageError("must have 1 to 200 characters", where="Idempotency-Key", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must have 1 to 200 characters", "Idempotency-Key")
     which, who = request.path_params["rig"], principal(request)
 
     def check() -> None:
@@ -203,15 +203,15 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
 
     def check() -> None:
         for name, run in (("without", body.without), ("with_body", body.with_body)):
-            if site.store.rehearsed(run):
+            known = site.store.request(run)
+            if known.rehearsal:
                 raise ValuesWrong([(name, "is a rehearsal of faults: no drive is calibrated by it")])
-            if site.store.request(run).rig != which.id:
-                raise UsageError(f"is not a run of rig {which.id}", where=f"run {run}",
-                                 next_step="Calibrate each drive by its own two runs", entry=MessageCode.REQUEST_WRONG)
-            if site.store.request(run).uploaded is not None:
-                raise UsageError("is an uploaded recording: it is not certain that it is of this drive",
-                                 where=f"run {run}", next_step="Calibrate with tdhil calibrate torque",
-                                 entry=MessageCode.REQUEST_WRONG)
+            if known.rig != which.id:
+                raise request_wrong(f"is not a run of rig {which.id}", f"run {run}",
+                                    "Calibrate each drive by its own two runs")
+            if known.uploaded is not None:
+                raise request_wrong("is an uploaded recording: it is not certain that it is of this drive",
+                                    f"run {run}", "Calibrate with tdhil calibrate torque")
             if not site.store.status(run).ended or not (site.store.place(run) / "run.mcap").is_file():
                 raise UsageError("the run has no finished log", where=f"run {run}",
                                  next_step="Wait until it has ended", entry=MessageCode.NOT_READY)

@@ -21,15 +21,7 @@ from drivers import Preflight, PreflightRefused
 from profiles import MessageCode, visible
 from tdhil.config import USUAL_STAGE_S
 from tdhil.numerics import prepare
-from tdhil.service.attendance import (
-    LEASE_S,
-    WATCHED,
-    Board,
-    Confirming,
-    ServiceOperator,
-    Watcher,
-    print_line,
-)
+from tdhil.service.attendance import LEASE_S, WATCHED, Board, Confirming, ServiceOperator, Watcher, print_line
 from tdhil.service.letterhead import stored_letterhead
 from tdhil.service.run_channel import STOP_FILE, ChannelListener
 from tdhil.service.run_state import State, Status, Told, Watch, end_of, now, way_to

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import traceback
 from collections.abc import Mapping
 from functools import partial
@@ -18,7 +17,7 @@ from tdhil.service.attendance import LEASE_S
 from tdhil.service.middleware import error_view, off, whole_number
 from tdhil.service.routing import apis
 from tdhil.service.run_filter import NEWEST, SORTS, Order, RunFilter, Summary
-from tdhil.service.run_state import NotThere, State, now
+from tdhil.service.run_state import NotThere, State, now, request_wrong
 from tdhil.service.schemas import (
     AcceptanceView,
     AnnotationsBody,
@@ -66,7 +65,7 @@ async def runs(site: Site, request: Request, body: None) -> list[Summary]:
     query = request.query_params
     limit = query.get("limit", "100")
     if whole_number(limit, 1, 1000) is None:
-        raise UsageError("must be 1 to 1000", where="limit", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be 1 to 1000", "limit")
     wanted = _filter(request)
     return await off(lambda: site.find_runs(wanted, limit=int(limit)))
 
@@ -76,11 +75,10 @@ async def runs_page(site: Site, request: Request, body: None) -> RunsPageView:
     query, wanted = request.query_params, _filter(request)
     page, key, way = query.get("page", "1"), query.get("sort", NEWEST.key), query.get("order", "desc")
     if not page.isdecimal() or not 1 <= int(page) <= LAST_PAGE:
-        raise UsageError(f"must be 1 to {LAST_PAGE}", where="page", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong(f"must be 1 to {LAST_PAGE}", "page")
     if key not in SORTS or way not in ("asc", "desc"):
-        raise UsageError("is not a sort order of this list", where="sort" if key not in SORTS else "order",
-                         next_step=f"Give sort={', '.join(SORTS)} and order=asc or desc",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("is not a sort order of this list", "sort" if key not in SORTS else "order",
+                            f"Give sort={', '.join(SORTS)} and order=asc or desc")
     return await off(lambda: site.runs_page(wanted, Order(key, way == "desc"), int(page)))
 
 
@@ -92,8 +90,7 @@ def _filter(request: Request) -> RunFilter:
                          next_step=f"States: {', '.join(State)}", entry=MessageCode.REQUEST_WRONG)
     for name in ("text", "rig", "verdict", "tag", "until"):
         if len(query.get(name, "")) > LONGEST_SEARCH:
-            raise UsageError(f"must be at most {LONGEST_SEARCH} characters", where=name,
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong(f"must be at most {LONGEST_SEARCH} characters", name)
     return RunFilter(query.get("rig"), state, query.get("verdict"), query.get("tag"), query.get("text", ""),
                      asks_for(request, "archived"), query.get("until"))
 
@@ -102,7 +99,7 @@ def asks_for(request: Request, what: str) -> bool:
     """Return whether the request asks for ``archived`` runs, or ``rehearsals``, too. Raises UsageError."""
     text = request.query_params.get(what, "false")
     if text not in ("true", "false"):
-        raise UsageError("must be true or false", where=what, entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be true or false", what)
     return bool(text == "true")
 
 
@@ -110,18 +107,16 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
     """Compare two to eight runs."""
     which = [one for one in request.query_params.get("runs", "").split(",") if one]
     if not 2 <= len(set(which)) == len(which) <= 8:
-        raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("name two to eight different runs", "runs", "?runs=ID,ID")
     archived, rehearsals = asks_for(request, "archived"), asks_for(request, "rehearsals")
     for one in which:
         if not (await off(partial(site.store.place, one)) / "run.mcap").is_file():
             raise NotThere("this run has no log", where=f"run {one}")
         if not archived and (await off(partial(site.store.annotations, one))).archived:
-            raise UsageError("this run is archived", where=f"run {one}", next_step="Add archived=true, or leave it out",
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("this run is archived", f"run {one}", "Add archived=true, or leave it out")
         if not rehearsals and await off(partial(site.store.rehearsed, one)):
-            raise UsageError("this run is a rehearsal of faults", where=f"run {one}",
-                             next_step="Add rehearsals=true, or leave it out", entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("this run is a rehearsal of faults", f"run {one}",
+                                "Add rehearsals=true, or leave it out")
     asked = {"runs": which, "runs_folder": str(site.store.runs)}
     return CompareView(which, await off(partial(_asked_at, site, which, await site.work("compare", None, asked))))
 
@@ -164,8 +159,7 @@ async def renew(site: Site, request: Request, body: LeaseBody) -> LeaseView:
 
 def _require_key(key: str | None, where: str) -> None:
     if key is not None and not 16 <= len(key) <= 200:
-        raise UsageError("must have 16 to 200 characters", where=where, next_step="Use a random key",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must have 16 to 200 characters", where, "Use a random key")
 
 
 async def stop(site: Site, request: Request, body: Any) -> RunView:
@@ -252,9 +246,7 @@ async def ask_replay(site: Site, request: Request, body: ReplayBody) -> tuple[in
     view = await off(lambda: _new_replay(site, which, asked, who))
     rig = (await off(lambda: site.store.request(which))).rig
     site.supervisor.note(who, f"replay {view.name} asked", which, rig, options=asked)
-    task = asyncio.get_running_loop().create_task(_replay_later(site, which, view))
-    site.tasks.add(task)
-    task.add_done_callback(site.tasks.discard)
+    site.in_background(_replay_later(site, which, view))
     return 202, view
 
 

@@ -207,9 +207,7 @@ class Status:
         history = tuple(Entered(State(one["state"]), one["at"], one.get("stage")) for one in known.pop("history"))
         if not history:
             raise ValueError("a run without a state")
-        for name, kind in (
-            ("stop", Stop), ("error", Told), ("confirmation", Confirmation), ("watch", Watch),
-        ):
+        for name, kind in (("stop", Stop), ("error", Told), ("confirmation", Confirmation), ("watch", Watch)):
             if known.get(name) is not None:
                 known[name] = kind(**known[name])
         known["identity_numbers"] = tuple(known.get("identity_numbers", ()))
@@ -338,6 +336,16 @@ def disk_full(error: BaseException) -> NoRoom | None:
                 what or f"the disk is full ({one.strerror})", where=where,
                 next_step=own if own.startswith(UNCHANGED) else "Free some disk space, then repeat the request")
     return None
+
+
+def request_wrong(what: str, where: str, next_step: str = "") -> UsageError:
+    """Return the refusal of a request over HTTP with a value that the service can't use."""
+    return UsageError(what, where=where, next_step=next_step, entry=MessageCode.REQUEST_WRONG)
+
+
+def option_wrong(what: str, where: str, next_step: str = "") -> UsageError:
+    """Return the refusal of an option of `tdhil serve`, or of what it names."""
+    return UsageError(what, where=where, next_step=next_step, entry=MessageCode.SERVICE_OPTION_WRONG)
 
 
 class NotReacting(CommunicationLost):

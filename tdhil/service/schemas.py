@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal
 
 from pydantic import ConfigDict, TypeAdapter
 
 from tdhil.buses import DoctorFinding
+from tdhil.config import Option
 from tdhil.service.acceptance_signature import AcceptanceSignature
 from tdhil.service.accounts import Role
 from tdhil.service.annotations import AnnotationEdit
@@ -652,8 +654,15 @@ RECORDING: Final = "Recording"
 """Body of a request about an upload: an object with the options of `tdhil replay`, and the rig."""
 EVIDENCE: Final = "Evidence"
 """Body of a request for an archive: an object with the statement of the publisher."""
-OBJECTS: Final = frozenset({OPTIONS, RECORDING, EVIDENCE})
-"""Bodies that are objects with options. Their handlers check them."""
+_NUMBERS: Final = "numbers in SI, or a text with a unit"
+OBJECTS: Final[Mapping[str, tuple[str, Mapping[str, Option]]]] = MappingProxyType({
+    OPTIONS: (f'the command line\'s options, such as {{"seed": 7, "tolerance": 0.01}}; {_NUMBERS}', TAKEN),
+    RECORDING: ("options of `tdhil replay` for a trace, such as "
+                f'{{"columns": ["time=t:s", "speed=n:rpm", "torque=m:Nm"]}}; {_NUMBERS}', ACCEPTED),
+    EVIDENCE: ("the options of `tdhil evidence`, such as "
+               '{"publisher": "The Institute", "publish": "log,result,identity"}', STATEMENT),
+})
+"""Bodies that are objects with options: their meaning, and the options. Their handlers check them."""
 FILE: Final = "File"
 """Body of an upload: the bytes of a file. Its handler receives and limits them."""
 
@@ -872,20 +881,12 @@ def document() -> dict[str, Any]:
         return {"x-role": role or "anybody", "security": [] if role is None else [{"session": []}, {"token": []}]}
 
     def schema(kind: Any, mode: Literal["validation", "serialization"] = "serialization") -> dict[str, Any]:
-        if kind == OPTIONS:
-            return {"type": "object", "description": "the command line's options, such as "
-                    '{"seed": 7, "tolerance": 0.01}; numbers in SI, or a text with a unit',
-                    "properties": {name: option_schema(one) for name, one in TAKEN.items()}}
-        if kind == RECORDING:
-            return {"type": "object", "description": "options of `tdhil replay` for a trace, such as "
-                    '{"columns": ["time=t:s", "speed=n:rpm", "torque=m:Nm"]}; numbers in SI, or a text with a unit',
-                    "properties": {
-                        "rig": {"type": "string", "description": "rig of the recording as you state it, '' for none"},
-                        **{name: option_schema(one) for name, one in ACCEPTED.items()}}}
-        if kind == EVIDENCE:
-            return {"type": "object", "description": "the options of `tdhil evidence`, such as "
-                    '{"publisher": "The Institute", "publish": "log,result,identity"}',
-                    "properties": {name: option_schema(one) for name, one in STATEMENT.items()}}
+        if kind in OBJECTS:
+            text, options = OBJECTS[kind]
+            rig = {"type": "string", "description": "rig of the recording as you state it, '' for none"}
+            return {"type": "object", "description": text, "properties": {
+                **({"rig": rig} if kind == RECORDING else {}),
+                **{name: option_schema(one) for name, one in options.items()}}}
         found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
         schemas.update(found.pop("$defs", {}))
         if isinstance(kind, type) and found.get("type") == "object":

@@ -9,7 +9,7 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.service.limits import UPLOAD_LIMIT
+from tdhil.service.run_state import option_wrong
 
 if TYPE_CHECKING:
     import uvicorn
@@ -58,12 +59,9 @@ class Tls:
         try:
             found.load_cert_chain(self.cert, self.key, password=_no_password)
         except (OSError, ValueError) as error:         # ssl.SSLError is an OSError
-            raise UsageError(
-                f"certificate and key can't be used ({getattr(error, 'strerror', None) or error})",
-                where=f"--tls-cert {self.cert} --tls-key {self.key}",
-                next_step="Both must be PEM and belong together, and the key must have no password",
-                entry=MessageCode.SERVICE_OPTION_WRONG,
-            ) from error
+            raise option_wrong(f"certificate and key can't be used ({getattr(error, 'strerror', None) or error})",
+                               f"--tls-cert {self.cert} --tls-key {self.key}",
+                               "Both must be PEM and belong together, and the key must have no password") from error
         return found
 
 
@@ -106,8 +104,7 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
             ipaddress.ip_address(name)
             continue
         if not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", name):
-            raise UsageError("must be a host's name or address, without a port", where=f"--allowed-host {name[:60]}",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("must be a host's name or address, without a port", f"--allowed-host {name[:60]}")
     return frozenset(one.lower() for one in ("127.0.0.1", "localhost", "::1", _reachable(host), *more))
 
 
@@ -152,18 +149,14 @@ def serve(
     if tls is not None:
         tls.context()
     allowed = _names(host, names)
-    for one in viewers:
-        if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", one):
-            raise UsageError("must be an origin of pages: scheme, host and port", where=f"--viewer {one[:100]}",
-                             next_step="For example http://localhost:8080, or file://",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
-    if rigs is not None and not rigs.is_dir():
-        raise UsageError("this folder does not exist", where=f"--rigs {rigs}",
-                         next_step="Create it, or name another folder of rig files",
-                         entry=MessageCode.FILE_NOT_FOUND)
-    if missing := [folder for folder in logs if not folder.is_dir()]:
-        raise UsageError("this folder does not exist", where=f"--logs {missing[0]}", next_step="Name a folder of logs",
-                         entry=MessageCode.FILE_NOT_FOUND)
+    for origin in viewers:
+        if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", origin):
+            raise option_wrong("must be an origin of pages: scheme, host and port", f"--viewer {origin[:100]}",
+                               "For example http://localhost:8080, or file://")
+    if rigs is not None:
+        require_folder(rigs, "--rigs", "Create it, or name another folder of rig files")
+    for one in logs:
+        require_folder(one, "--logs", "Name a folder of logs")
 
     from tdhil.service.access import Access
     from tdhil.service.audit import Audit
@@ -189,7 +182,7 @@ def serve(
     room = Room.of(raise_limit())
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
               logs={str(one): one for one in logs}, upload_limit=upload_limit)
-    publisher = None if broker is None else Publisher(broker, web.broker_messages, say)
+    senders: list[Publisher | Notifier] = [] if broker is None else [Publisher(broker, web.broker_messages, say)]
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     linked = _reachable(host, names)
@@ -204,19 +197,15 @@ def serve(
         say(f"Ignored, because the name is not that of a rig file: {', '.join(left_out)}."
             " Use NAME.yaml, with letters, digits, _, . and -")
     say("A stop over HTTP is no emergency stop: keep the hard-wired stop within reach. Ctrl-C stops all runs.")
-    if publisher is not None:
-        publisher.start()
-    notifiers = [Notifier(one.at(site), lambda: web.find_runs(RunFilter(), limit=RUNS), web.trends_around, say)
-                 for one in messages]
-    for notifier in notifiers:
-        notifier.start()
+    senders += [Notifier(one.at(site), lambda: web.find_runs(RunFilter(), limit=RUNS), web.trends_around, say)
+                for one in messages]
+    for sender in senders:
+        sender.start()
     try:
         _uvicorn(web.asgi, listening, supervisor.brake, say, tls, room)
     finally:
-        if publisher is not None:
-            publisher.close()
-        for notifier in notifiers:
-            notifier.close()
+        for sender in senders:
+            sender.close()
         listening.close()
         alone.close()
     left = sorted({*supervisor.live(), *supervisor.not_at_rest})
@@ -226,10 +215,10 @@ def serve(
     return int(ExitCode.OK)
 
 
-def require_folder(data: Path) -> None:
-    """Raise UsageError if the folder does not exist: its name is probably misspelt."""
-    if not data.is_dir():
-        raise UsageError("this folder does not exist", where=f"--data {data}", next_step="Name the service's folder",
+def require_folder(folder: Path, option: str = "--data", next_step: str = "Name the service's folder") -> None:
+    """Raise UsageError if the folder of an option does not exist: its name is probably misspelt."""
+    if not folder.is_dir():
+        raise UsageError("this folder does not exist", where=f"{option} {folder}", next_step=next_step,
                          entry=MessageCode.FILE_NOT_FOUND)
 
 
@@ -296,18 +285,12 @@ def _uvicorn(
 
     server = Server(config)
     former = {number: signal.signal(number, _ender(server, brake, say)) for number in (signal.SIGINT, signal.SIGTERM)}
-    object.__setattr__(server, "capture_signals", _nothing_captured)       # SIGTERM stops the runs first
+    object.__setattr__(server, "capture_signals", nullcontext)       # SIGTERM stops the runs first
     try:
         server.run(sockets=[listening])
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
-
-
-def _nothing_captured() -> Any:
-    from contextlib import nullcontext
-
-    return nullcontext()
 
 
 def _ender(server: uvicorn.Server, brake: Callable[[str], bool], say: Say) -> Callable[[int, Any], None]:
@@ -341,10 +324,8 @@ def _listen(host: str, port: int) -> socket.socket:
         found.bind((host, port))
     except (OSError, OverflowError) as error:
         found.close()
-        raise UsageError(f"this address can't be opened ({getattr(error, 'strerror', None) or error})",
-                         where=f"{host}:{port}",
-                         next_step="Is tdhil serve running already? Name another --port",
-                         entry=MessageCode.SERVICE_OPTION_WRONG) from error
+        raise option_wrong(f"this address can't be opened ({getattr(error, 'strerror', None) or error})",
+                           f"{host}:{port}", "Is tdhil serve running already? Name another --port") from error
     found.listen(BACKLOG)
     return found
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 from prometheus_client import generate_latest
 from starlette.responses import Response
 
-from tdhil.errors import MessageCode, UsageError
 from tdhil.service import letterhead as letterheads
 from tdhil.service.access import principal
 from tdhil.service.audit import ChainHead
 from tdhil.service.letterhead import stored_letterhead
 from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import api
+from tdhil.service.run_state import request_wrong
 from tdhil.service.schemas import AuditView, HealthView, LetterheadBody, LetterheadView, document
 from tdhil.version import __version__
 
@@ -44,7 +44,7 @@ async def audit(site: Site, request: Request, body: None) -> AuditView:
     """Return the newest lines of the audit, and whether its chain is intact."""
     limit = request.query_params.get("limit", "200")
     if whole_number(limit, 1, 5000) is None:
-        raise UsageError("must be 1 to 5000", where="limit", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be 1 to 5000", "limit")
 
     given = request.query_params.get("head")
     kept = None if given is None else ChainHead.of(given)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -24,7 +24,7 @@ from tdhil.errors import TdhilError
 from tdhil.service.acceptance_signature import FILE as SIGNATURE_FILE
 from tdhil.service.access import Access
 from tdhil.service.document_cache import DocumentCache
-from tdhil.service.evidence_request import ABOUT, ARCHIVE, evidence_in
+from tdhil.service.evidence_request import ABOUT, ARCHIVE, EvidenceView
 from tdhil.service.fleets import Fleets
 from tdhil.service.letterhead import outdated_reports
 from tdhil.service.limits import UPLOAD_LIMIT
@@ -35,7 +35,7 @@ from tdhil.service.run_filter import NEWEST, Order, RunFilter, Summary
 from tdhil.service.run_state import NotThere, State, Status
 from tdhil.service.schemas import ReplayView, RigView, RunsPageView, RunView, adapter
 from tdhil.service.start_request import RigFile
-from tdhil.service.store import read_json
+from tdhil.service.store import read_as, read_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.uploads import TRACE, Uploads
 from tdhil.session import Holder
@@ -66,18 +66,16 @@ class Metrics:
     """Metrics for Prometheus."""
 
     def __init__(self) -> None:
-        self.registry = CollectorRegistry()
-        self.runs_asked = Counter("tdhil_runs_asked", "Runs that were requested, without rehearsals",
-                                  registry=self.registry)
+        found = self.registry = CollectorRegistry()
+        self.runs_asked = Counter("tdhil_runs_asked", "Runs that were requested, without rehearsals", registry=found)
         self.rehearsals_asked = Counter("tdhil_rehearsals_asked", "Rehearsals of faults that were requested",
-                                        registry=self.registry)
-        self.stops_asked = Counter("tdhil_stops_asked", "Stops that were requested", registry=self.registry)
-        self.live = Gauge("tdhil_runs_live", "Runs that have not ended, without rehearsals", registry=self.registry)
-        self.rehearsed = Gauge("tdhil_rehearsals_live", "Rehearsals that have not ended", registry=self.registry)
-        self.viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=self.registry)
-        self.relayed = Gauge("tdhil_foxglove_viewers", "Viewers that are sent a log as it grows",
-                             registry=self.registry)
-        self.unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop is not signed off", registry=self.registry)
+                                        registry=found)
+        self.stops_asked = Counter("tdhil_stops_asked", "Stops that were requested", registry=found)
+        self.live = Gauge("tdhil_runs_live", "Runs that have not ended, without rehearsals", registry=found)
+        self.rehearsed = Gauge("tdhil_rehearsals_live", "Rehearsals that have not ended", registry=found)
+        self.viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=found)
+        self.relayed = Gauge("tdhil_foxglove_viewers", "Viewers that are sent a log as it grows", registry=found)
+        self.unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop is not signed off", registry=found)
 
 
 class Site:
@@ -146,16 +144,20 @@ class Site:
             joined()
         return await asyncio.shield(task)          # a client that disconnects ends no stop
 
+    def in_background(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        """Begin work that no request waits for. Return its task."""
+        task = asyncio.get_running_loop().create_task(work)
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+        return task
+
     def stop_beside(self, run: str, holder: Holder | None, who: str) -> asyncio.Task[tuple[int, str]] | None:
         """Begin to stop the drive of a run that another program holds. Return the stop; None without a holder."""
         if holder is None:
             return None
-        task = asyncio.get_running_loop().create_task(self.shared_stop(
+        return self.in_background(self.shared_stop(
             f"beside {run}", partial(self.supervisor.stop_beside, run, holder, who),
             lambda: self.supervisor.note(who, "stop asked", run, None, joined=True)))
-        self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
-        return task
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Compute a task, one at a time. Return its document; from the cache if it can't differ. Raises Refused."""
@@ -312,7 +314,7 @@ class Site:
             tags=list(annotations.tags), archived=annotations.archived, edits=list(annotations.edits),
             signature=self.records.signature(run),
             uploaded=None if request.uploaded is None else dict(request.uploaded),
-            evidence=evidence_in(read_json(folder / ABOUT)),
+            evidence=read_as(EvidenceView, folder / ABOUT),
             outdated=outdated_reports(folder, SIGNATURE_FILE, annotations),
             **{name: annotations.text(name, request.options) for name in STATED},
         )

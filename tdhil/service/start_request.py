@@ -35,7 +35,7 @@ from tdhil.config import (
     wrong_values,
 )
 from tdhil.errors import MessageCode, TdhilError, UsageError
-from tdhil.service.run_state import NotAllowed, NotThere
+from tdhil.service.run_state import NotAllowed, NotThere, request_wrong
 from tdhil.session import address_of, connection_of
 
 if TYPE_CHECKING:
@@ -62,8 +62,8 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(reason, str) and value not in (None, False):
             raise NotAllowed(reason, where=name, next_step="Run it at the rig: tdhil identify")
         if name not in TAKEN:
-            raise UsageError("is not an option of a run over HTTP", where=str(given)[:60],
-                             next_step=f"Options: {', '.join(sorted(TAKEN))}", entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("is not an option of a run over HTTP", str(given)[:60],
+                                f"Options: {', '.join(sorted(TAKEN))}")
         if value is None:
             continue
         try:
@@ -75,8 +75,7 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     except UsageError as error:
         wrong.append((OPTION["expect"].name, error.what))
     wrong += [(name, limits_in_words(OPTION.get(name), found.get(name)) or text) for name, text in wrong_values(found)]
-    if wrong:
-        raise ValuesWrong(wrong)
+    require_right(wrong)
     return found
 
 
@@ -129,6 +128,12 @@ class ValuesWrong(UsageError):
         super().__init__("; ".join((what, *(f"{other}: {text}" for other, text in more))), where=name)
 
 
+def require_right(wrong: Sequence[tuple[str, str]]) -> None:
+    """Raise ValuesWrong with all wrong values, if there are any."""
+    if wrong:
+        raise ValuesWrong(wrong)
+
+
 def value_of(option: Option, value: Any) -> Any:
     """Parse a value as on the command line. The checks of its limits follow later. Raises UsageError."""
     where = option.name
@@ -136,7 +141,7 @@ def value_of(option: Option, value: Any) -> Any:
         try:
             return float(value if isinstance(value, str) or not isinstance(value, bool) else "")
         except (TypeError, ValueError):
-            raise UsageError("must be a number", where=where, entry=MessageCode.REQUEST_WRONG) from None
+            raise request_wrong("must be a number", where) from None
     if option.unit is not None:
         if isinstance(value, str):
             try:
@@ -144,24 +149,22 @@ def value_of(option: Option, value: Any) -> Any:
             except ValueError as error:
                 raise UsageError(str(error), where=where) from None
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UsageError("must be a number, or a text with a unit", where=where, entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("must be a number, or a text with a unit", where)
         return float(value)
     if option.joined:
         values = [value] if isinstance(value, str) else value
         if not isinstance(values, list) or not all(isinstance(one, str) for one in values):
-            raise UsageError("must be a text, or a list of texts", where=where, entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("must be a text, or a list of texts", where)
         if option.allowed and (wrong := set(values) - set(option.allowed)):
             *first, last = option.allowed
-            raise UsageError(f"must be {', '.join(first)} or {last}, not {', '.join(sorted(wrong))[:60]}", where=where,
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong(f"must be {', '.join(first)} or {last}, not {', '.join(sorted(wrong))[:60]}", where)
         return values
     if option.longest is not None and not (isinstance(value, str) and len(value) <= option.longest):
-        raise UsageError(f"must be a text of at most {option.longest} characters", where=where,
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong(f"must be a text of at most {option.longest} characters", where)
     if option.kind is int and isinstance(value, str):
-        raise UsageError("must be a whole number", where=where, entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be a whole number", where)
     if option.kind is bool and not isinstance(value, bool):
-        raise UsageError("must be true or false", where=where, entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be true or false", where)
     return value
 
 
@@ -399,7 +402,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
     if not peer.embedded:
         for one in OPTIONS:
             if one.group is Topic.SIMULATED and asked.get(one.name):
-                raise UsageError("is for a simulated rig", where=one.name, entry=MessageCode.REQUEST_WRONG)
+                raise request_wrong("is for a simulated rig", one.name)
     return RunRequest.of(
         options, connection, replace(peer, left_in=left_in), rig.rig, overrides=Overrides.of(asked),
         stated=details.texts(), expect=details.expect,

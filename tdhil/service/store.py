@@ -22,7 +22,7 @@ from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from tdhil.config import STATED
 from tdhil.errors import LogUnopened
@@ -31,6 +31,7 @@ from tdhil.service.annotations import Annotations
 from tdhil.service.run_filter import NEWEST, SEARCHED_COLUMN, Order, RunFilter, Summary
 from tdhil.service.run_state import NotThere, State, Status, now
 
+T = TypeVar("T")
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 """Id of a run: date, time (UTC), and a random part."""
 _FILE_LIMIT: Final = 16 * 2**20
@@ -87,6 +88,13 @@ def read_json(path: Path) -> dict[str, Any] | None:
         if path.stat().st_size <= _FILE_LIMIT:
             found = json.loads(path.read_bytes())
             return found if isinstance(found, dict) else None
+    return None
+
+
+def read_as(kind: type[T], path: Path) -> T | None:
+    """Return the dataclass in the file; None if it can't be read."""
+    with suppress(TypeError):
+        return None if (plain := read_json(path)) is None else kind(**plain)
     return None
 
 

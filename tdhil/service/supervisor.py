@@ -43,6 +43,7 @@ from tdhil.service.run_state import (
     Watch,
     blocking,
     now,
+    option_wrong,
     way_to,
 )
 from tdhil.service.start_request import (
@@ -156,7 +157,7 @@ class Supervisor:
                     self._live[run] = None
                 elif status.state is State.STOP_NOT_CONFIRMED:
                     self._unconfirmed[run] = status
-        self._in_background(self._begin_audit)
+        self._in_background(lambda: self._audited(self.audit.begin))
         self._in_background(self._rebuild_index)       # with entries that a killed web did not write
         self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
         self._thread.start()
@@ -436,10 +437,10 @@ class Supervisor:
         self.note(who, "stop asked", None, rig.id)
         if (bad := self.blocking_run(rig)) is not None:
             seen, said = self._stop_drive_of(self.store.request(bad), self.store.status(bad))
-            return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
-        if rig.simulated:
-            return int(ExitCode.OK), SIMULATED_STOP
-        seen, said = _stop_seen(_tdhil_stop(rig.path))
+        elif rig.simulated:
+            seen, said = True, SIMULATED_STOP
+        else:
+            seen, said = _stop_seen(_tdhil_stop(rig.path))
         return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
 
     def _stop_drive_of(self, request: StoredRequest, status: Status) -> tuple[bool, str]:
@@ -517,8 +518,8 @@ class Supervisor:
         """
         folder = self.rigs.folder
         if folder is None:
-            raise UsageError("this service has no folder of rigs", where=f"rig {rig_id[:64]}",
-                             next_step="Start it with tdhil serve --rigs DIR", entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("this service has no folder of rigs", f"rig {rig_id[:64]}",
+                               "Start it with tdhil serve --rigs DIR")
         if not RIG_ID.fullmatch(rig_id):
             raise ValuesWrong([("id", "must be letters, digits, _, . and -, and begin with a letter or digit")])
         path = folder / f"{rig_id}.yaml"
@@ -654,13 +655,7 @@ class Supervisor:
 
     def note(self, who: str, what: str, run: str | None, rig: str | None, **details: Any) -> None:
         """Write a line to the audit later; nothing waits for it."""
-        def write() -> None:
-            try:
-                self.audit.note(who, what, run=run, rig=rig, **details)
-            except OSError as error:
-                self.say(f"the audit can't be written: {error}")
-
-        self._notes.add(write)
+        self._notes.add(lambda: self._audited(lambda: self.audit.note(who, what, run=run, rig=rig, **details)))
         if run is not None:
             self._index_later(run)
 
@@ -679,9 +674,9 @@ class Supervisor:
             self._being_indexed.add(run)
             self._indexing.add(lambda: self._index(run))
 
-    def _begin_audit(self) -> None:
+    def _audited(self, write: Callable[[], None]) -> None:
         try:
-            self.audit.begin()
+            write()
         except OSError as error:
             self.say(f"the audit can't be written: {error}")
 

@@ -7,8 +7,9 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from tdhil.config import ASKED_AGAIN, OF_A_TRACE, OF_EVIDENCE, OPTION, OPTIONS, STATED
-from tdhil.errors import MessageCode, UsageError
-from tdhil.service.start_request import ValuesWrong, limits_in_words, value_of
+from tdhil.errors import UsageError
+from tdhil.service.run_state import request_wrong
+from tdhil.service.start_request import limits_in_words, value_of
 
 RIG: Final = "rig"
 """Key of the rig as the person states it, '' for none."""
@@ -47,9 +48,8 @@ def upload_options(body: Mapping[str, Any], kind: str) -> tuple[dict[str, Any], 
             continue
         option = ACCEPTED.get(str(name))
         if option is None:
-            raise UsageError("is not an option of an upload", where=str(name)[:60],
-                             next_step=f"Options: {', '.join(sorted((RIG, *ACCEPTED)))}",
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("is not an option of an upload", str(name)[:60],
+                                f"Options: {', '.join(sorted((RIG, *ACCEPTED)))}")
         if value in (None, "", []):
             continue
         if kind == "log" and name in _OF_A_TRACE:
@@ -78,9 +78,3 @@ def columns_wrong(options: Mapping[str, Any], names: Sequence[str]) -> list[tupl
 
     mistakes = column_mistakes(options.get(_COLUMNS, ()), names, rated=_RATED in options)
     return [(field_of(quantity), text) for quantity, text in mistakes]
-
-
-def require_right(wrong: Sequence[tuple[str, str]]) -> None:
-    """Raise ValuesWrong with all wrong values, if there are any."""
-    if wrong:
-        raise ValuesWrong(wrong)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 import traceback
 from collections.abc import Mapping
@@ -10,15 +9,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import anyio
 
-from tdhil.errors import MessageCode, TdhilError, UsageError
+from tdhil.errors import TdhilError
 from tdhil.recording import survey_trace
 from tdhil.service.access import principal
 from tdhil.service.door import ADMITTED, HEADERS_S
 from tdhil.service.middleware import error_view, fields_of, off
 from tdhil.service.routing import apis
-from tdhil.service.run_state import TooSlow
+from tdhil.service.run_state import TooSlow, request_wrong
 from tdhil.service.schemas import PreviewView, UploadsView
-from tdhil.service.upload_request import RIG, columns_wrong, require_right, upload_options
+from tdhil.service.start_request import require_right
+from tdhil.service.upload_request import RIG, columns_wrong, upload_options
 from tdhil.service.uploads import TRACE, Receiving, Upload
 
 if TYPE_CHECKING:
@@ -61,8 +61,7 @@ async def upload(site: Site, request: Request, body: None) -> Upload:
     who, name = principal(request).name, request.query_params.get("name", "")
     media = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if media != MEDIA:
-        raise UsageError("must be the file itself, as raw bytes", where=f"content-type {media[:60]}",
-                         next_step=f"Use {MEDIA}", entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("must be the file itself, as raw bytes", f"content-type {media[:60]}", f"Use {MEDIA}")
     stated = request.headers.get("content-length", "")
     received = await off(lambda: site.uploads.begin(int(stated) if stated.isdecimal() else None))
     request.scope[ADMITTED] = True
@@ -125,9 +124,7 @@ async def identify_upload(site: Site, request: Request, body: Mapping[str, Any])
         wrong += columns_wrong(options, (await off(lambda: survey_trace(place / TRACE))).names)
     require_right(wrong)
     found = await off(lambda: site.uploads.begin_identifying(found.id))
-    task = asyncio.get_running_loop().create_task(_identify_later(site, found, rig, options, who))
-    site.tasks.add(task)
-    task.add_done_callback(site.tasks.discard)
+    site.in_background(_identify_later(site, found, rig, options, who))
     return 202, found
 
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tdhil.config import ASKED_AGAIN, OF_A_TRACE, STATED
-from tdhil.errors import ExitCode, LogError, MessageCode, TdhilError, UsageError
-from tdhil.service.run_state import Told
+from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
+from tdhil.service.run_state import Told, request_wrong
 from tdhil.service.store import LOG, read_json, write_json
 from tdhil.service.upload_request import columns_wrong
 from tdhil.service.uploads import MOTION, TRACE
@@ -56,9 +56,8 @@ def read_upload(kind: str, options: Mapping[str, Any]) -> RunRecord:
     record = read(LOG)
     record.require_motion()
     if is_evaluation(record.configuration) or is_verification(record.configuration):
-        raise UsageError("this log contains a virtual string or steps of the speed loop, and no motion for J",
-                         where=LOG, next_step="Evaluate it in a terminal: tdhil replay",
-                         entry=MessageCode.REQUEST_WRONG)
+        raise request_wrong("this log contains a virtual string or steps of the speed loop, and no motion for J", LOG,
+                            "Evaluate it in a terminal: tdhil replay")
     return record
 
 

@@ -20,15 +20,15 @@ import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal
 
 from profiles import visible
-from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.errors import LogError, TdhilError
 from tdhil.service.limits import MEBIBYTE, UPLOAD_LIMIT
-from tdhil.service.run_state import FULL, Conflict, NoRoom, NotThere, Status, Told, TooLarge, now
+from tdhil.service.run_state import FULL, Conflict, NoRoom, NotThere, Status, Told, TooLarge, now, request_wrong
 from tdhil.service.store import LOG, Store, StoredRequest, read_json, write_json
 
 AT_ONCE: Final = 2
@@ -117,15 +117,6 @@ class Receiving:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-@dataclass
-class _Memory:
-    """Present state of the uploads, which no file has. ``finished``: the run of each identified upload."""
-
-    receiving: int = 0
-    states: dict[str, tuple[UploadState, Told | None]] = field(default_factory=dict)
-    finished: dict[str, Upload] = field(default_factory=dict)
-
-
 class Uploads:
     """The uploads of one service, for any thread. ``limit``: largest file, bytes; ``note`` writes to the audit."""
 
@@ -133,7 +124,9 @@ class Uploads:
         self._store, self._note, self.limit = store, note, limit
         self.folder = store.folder / FOLDER
         self._lock = threading.RLock()         # an upload becomes a run, or is found, but never in between
-        self._memory = _Memory()
+        self._receiving = 0
+        self._states: dict[str, tuple[UploadState, Told | None]] = {}
+        self._finished: dict[str, Upload] = {}         # those that are a run now
 
     def start(self) -> None:
         """Delete half received files of a service that ended, and uploads that were not identified in time."""
@@ -154,13 +147,13 @@ class Uploads:
             raise too_large(self.limit)
         self._delete_old()
         with self._lock:
-            if self._memory.receiving >= AT_ONCE:
+            if self._receiving >= AT_ONCE:
                 raise Conflict(f"{AT_ONCE} uploads are in progress, which is the limit", where=FOLDER,
                                next_step="Wait until one has ended")
-            if len(self._ids()) + self._memory.receiving >= WAITING:
+            if len(self._ids()) + self._receiving >= WAITING:
                 raise Conflict(f"{WAITING} uploads wait to be identified, which is the limit", where=FOLDER,
                                next_step="Identify or delete one of them")
-            self._memory.receiving += 1
+            self._receiving += 1
         folder = self.folder / f".{secrets.token_hex(8)}"
         try:
             if self._free() < KEPT_FREE + (length or 0):
@@ -179,8 +172,7 @@ class Uploads:
 
         sha256 = received.finish()
         if not received.size:
-            raise UsageError("the file is empty", where=shown_name(name), next_step="Choose another file",
-                             entry=MessageCode.REQUEST_WRONG)
+            raise request_wrong("the file is empty", shown_name(name), "Choose another file")
         raw = received.folder / _RAW
         log = is_log(raw)
         found = Upload(received.folder.name[1:], shown_name(name), received.size, sha256, who, now(),
@@ -199,7 +191,7 @@ class Uploads:
         if received is not None:
             received.close()
         with self._lock:
-            self._memory.receiving -= 1
+            self._receiving -= 1
 
     # -- what waits ----------------------------------------------------------------------------------------------
 
@@ -215,14 +207,14 @@ class Uploads:
     def get(self, upload: str) -> Upload:
         """Return one upload, also for some time after it became a run. Raises NotThere."""
         with self._lock:
-            if (finished := self._memory.finished.get(upload)) is not None:
+            if (finished := self._finished.get(upload)) is not None:
                 return finished
             plain = read_json(self.place(upload) / _ABOUT)
             try:
                 found = Upload(id=upload, **(plain or {}))
             except TypeError:
                 raise _not_there(upload) from None
-            state, error = self._memory.states.get(upload, ("waiting", None))
+            state, error = self._states.get(upload, ("waiting", None))
             return replace(found, state=state, error=error)
 
     def place(self, upload: str) -> Path:
@@ -236,7 +228,7 @@ class Uploads:
         """Delete an upload. Raises NotThere, and Conflict while it is identified."""
         found = self.get(upload)
         with self._lock:
-            if self._memory.states.get(upload, ("waiting", None))[0] in BUSY or found.run is not None:
+            if self._states.get(upload, ("waiting", None))[0] in BUSY or found.run is not None:
                 raise Conflict(f"the upload is {'identified' if found.run else 'being identified'}",
                                where=f"upload {upload}", next_step="Delete the run that is made from it")
             self._remove(upload)
@@ -251,18 +243,18 @@ class Uploads:
             if found.state in BUSY or found.run is not None:
                 raise Conflict("this upload is already identified" if found.run else "this upload is being identified",
                                where=f"upload {upload}", next_step="Wait for its run")
-            self._memory.states[upload] = ("identifying", None)
+            self._states[upload] = ("identifying", None)
         return replace(found, state="identifying", error=None)
 
     def delay(self, upload: str, *, delayed: bool) -> None:
         """Keep whether the identification waits until no real shaft turns."""
         with self._lock:
-            self._memory.states[upload] = ("delayed" if delayed else "identifying", None)
+            self._states[upload] = ("delayed" if delayed else "identifying", None)
 
     def failed(self, upload: str, error: Told) -> None:
         """Keep the reason why an upload could not be identified. It can be identified again with another mapping."""
         with self._lock:
-            self._memory.states[upload] = ("failed", error)
+            self._states[upload] = ("failed", error)
 
     def become_run(
         self, upload: Upload, rig: str, options: Mapping[str, Any], who: str, document: Mapping[str, Any]
@@ -290,11 +282,10 @@ class Uploads:
                 with suppress(OSError):
                     (self._store.runs / run).rmdir()
                 raise
-            self._memory.states.pop(upload.id, None)
-            finished = self._memory.finished
-            finished[upload.id] = replace(upload, state="done", run=run)
-            for old in list(finished)[:-FINISHED]:
-                del finished[old]
+            self._states.pop(upload.id, None)
+            self._finished[upload.id] = replace(upload, state="done", run=run)
+            for old in list(self._finished)[:-FINISHED]:
+                del self._finished[old]
         self._note(who, "upload identified", run, rig or None, upload=upload.id, file=upload.name,
                    sha256=upload.sha256, verdict=document["verdict"])
         return run
@@ -314,7 +305,7 @@ class Uploads:
         with suppress(OSError):
             gone = (self.folder / upload).rename(self.folder / f".{upload}")
             shutil.rmtree(gone, ignore_errors=True)
-        self._memory.states.pop(upload, None)
+        self._states.pop(upload, None)
 
     def _delete_old(self) -> None:
         before = datetime.fromisoformat(now()) - timedelta(seconds=KEPT_S)

@@ -27,7 +27,7 @@ from starlette.routing import BaseRoute, Match, Route, WebSocketRoute
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.errors import LogError, TdhilError, UsageError
 from tdhil.service import (
     auth_routes,
     evidence_routes,
@@ -48,7 +48,7 @@ from tdhil.service.live_feed import Feed
 from tdhil.service.middleware import RequestGuard, error_response, error_view, off, status_of
 from tdhil.service.page_routes import Pages
 from tdhil.service.run_channel import tell_viewed
-from tdhil.service.run_state import NotLoggedIn, NotThere, disk_full
+from tdhil.service.run_state import NotLoggedIn, NotThere, disk_full, request_wrong
 from tdhil.service.schemas import SOCKETS
 from tdhil.service.site import Site
 from tdhil.service.supervisor import Supervisor
@@ -119,9 +119,8 @@ class Web(Site):
             routes = [one for one in self.app.routes
                       if isinstance(one, Route) and one.matches(request.scope)[0] is not Match.NONE]
             methods = ", ".join(sorted({method for one in routes for method in one.methods or ()}))
-            error, status, headers = UsageError(
-                f"supports {methods}, not {request.method[:20]}", where=path[:100],
-                                                entry=MessageCode.REQUEST_WRONG), 405, {"allow": methods}
+            error = request_wrong(f"supports {methods}, not {request.method[:20]}", path[:100])
+            status, headers = 405, {"allow": methods}
         elif isinstance(error, HTTPException) and error.status_code == 404:
             listed = f"See {API}/openapi.json" if path.startswith(API) else ""
             error = NotThere("this address does not exist", where=path[:100], next_step=listed)

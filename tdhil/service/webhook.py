@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from tdhil.errors import MessageCode, UsageError
+from tdhil.service.run_state import option_wrong
 
 TIMEOUT_S: Final = 10.0
 """Longest wait for a connection and for the reply, s."""
@@ -43,20 +43,18 @@ class Webhook:
         except ValueError:
             good = False
         if not good:
-            raise UsageError("must be http:// or https://, a host, and optionally a port and a path", where="--webhook",
-                             next_step="Use https://host/path", entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("must be http:// or https://, a host, and optionally a port and a path", "--webhook",
+                               "Use https://host/path")
         if parts.password is not None or parts.username is not None:
-            raise UsageError("a user or a password must not be in the address", where="--webhook",
-                             next_step=f"Put a secret into a file, and name the file in {SECRET_FILE}",
-                             entry=MessageCode.SERVICE_OPTION_WRONG)
+            raise option_wrong("a user or a password must not be in the address", "--webhook",
+                               f"Put a secret into a file, and name the file in {SECRET_FILE}")
         secret = None
         if (name := environment.get(SECRET_FILE)) is not None:
             try:
                 secret = Path(name).read_bytes().strip()
             except OSError as error:
-                raise UsageError(f"can't be read ({error.strerror or error})", where=f"{SECRET_FILE} {name}",
-                                 next_step="The file must contain only the secret, readable by its owner only",
-                                 entry=MessageCode.SERVICE_OPTION_WRONG) from None
+                raise option_wrong(f"can't be read ({error.strerror or error})", f"{SECRET_FILE} {name}",
+                                   "The file must contain only the secret, readable by its owner only") from None
         return Webhook(url, secret)
 
     @property

@@ -88,10 +88,10 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
 def _signed(document: dict[str, Any]) -> dict[str, Any]:
     """Return the result in the present folder with the signature under its acceptance, if a person signed it."""
     from tdhil.file_hash import sha256_of
-    from tdhil.service.acceptance_signature import FILE, signature_in
-    from tdhil.service.store import read_json
+    from tdhil.service.acceptance_signature import FILE, AcceptanceSignature
+    from tdhil.service.store import read_as
 
-    acceptance, signature = document.get("acceptance"), signature_in(read_json(Path(FILE)))
+    acceptance, signature = document.get("acceptance"), read_as(AcceptanceSignature, Path(FILE))
     if not acceptance or signature is None:
         return document
     problem = signature.problem(acceptance, sha256_of(Path("run.mcap"), missing=""))

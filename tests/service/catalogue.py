@@ -26,7 +26,7 @@ TEMPLATES = sorted((SERVICE / "templates").glob("*.html"))
 ELSEWHERE = {"client.py", "console.py", "mail.py", "mqtt.py", "server.py", "webhook.py", "password_file.py", "audit.py"}
 """Modules of the service whose errors no page shows: they are of the terminal."""
 _ERRORS = re.compile(r"(Error|Refused|ValuesWrong|NotAllowed|Conflict|NotThere|NoRoom|TooLarge|TooSlow|NotLoggedIn"
-                     r"|TooManyTries|NotReacting)$")
+                     r"|TooManyTries|NotReacting|request_wrong|option_wrong)$")
 
 
 class Text(NamedTuple):
@@ -68,7 +68,8 @@ def of_errors() -> Iterator[Text]:
                 continue
             fields = (pair.elts[1] for one in call.args[:1] for pair in ast.walk(one)
                       if isinstance(pair, ast.Tuple) and len(pair.elts) == 2)          # of ValuesWrong
-            for node in (*call.args[:1], *fields, *(one.value for one in call.keywords if one.arg == "next_step")):
+            steps = (*call.args[2:3], *(one.value for one in call.keywords if one.arg == "next_step"))
+            for node in (*call.args[:1], *fields, *steps):
                 for part in (node.body, node.orelse) if isinstance(node, ast.IfExp) else (node,):
                     text = None if "dimension" in ast.unparse(part) else _pattern(part)      # its word is English
                     if text and re.search(r"[a-z]{2,} \S", re.sub(r"\{\d\}", "", text)):
