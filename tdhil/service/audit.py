@@ -28,7 +28,7 @@ import os
 import re
 import secrets
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -57,6 +57,10 @@ class Entry:
     details: Mapping[str, Any] = field(default_factory=dict)
     before: str = FIRST
     hash: str = ""
+
+
+_Line = tuple[str, int, Entry | str]
+"""A line of the chain: its file, its number there (from 1), and its entry, or why it has none."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +140,7 @@ class Audit:
     def head(self) -> ChainHead | None:
         """Return the last line, for export; None if there is none, or if the chain's end is broken."""
         with self._lock, self._alone():
-            seal = self._seal or self._read()
-            found = None if seal is None else self._end(seal)
-        return found if found is not None and found.number > 0 else None
+            return self._head(self._seal or self._read(), self.entries())
 
     def made(self) -> str | None:
         """Return when the key was made; None without a key. A time after the first line means: the key was replaced."""
@@ -147,9 +149,7 @@ class Audit:
 
     def entries(self) -> Iterator[Entry]:
         """Yield all readable entries in order."""
-        for _, _, entry in self._lines():
-            if isinstance(entry, Entry):
-                yield entry
+        yield from _readable(self._lines())
 
     def verify(self, kept: ChainHead | None = None) -> Broken | None:
         """Return the first place where a line was changed, removed or inserted; None if the chain is intact.
@@ -157,11 +157,22 @@ class Audit:
         ``kept``: a head that was exported before. It must be one of the lines.
         """
         with self._lock, self._alone():
-            return self._verify(self._seal or self._read(), kept)
+            return self._verify(self._seal or self._read(), kept, self._lines())
 
-    def _verify(self, seal: _Seal | None, kept: ChainHead | None) -> Broken | None:
+    def examined(self, kept: ChainHead | None = None) -> tuple[list[Entry], Broken | None, ChainHead | None]:
+        """Return `entries`, `verify` and `head` of one reading of the files."""
+        with self._lock, self._alone():
+            seal, lines = self._seal or self._read(), list(self._lines())
+            entries = list(_readable(lines))
+            return entries, self._verify(seal, kept, lines), self._head(seal, entries)
+
+    def _head(self, seal: _Seal | None, entries: Iterable[Entry]) -> ChainHead | None:
+        found = None if seal is None else self._end(seal, entries)
+        return found if found is not None and found.number > 0 else None
+
+    def _verify(self, seal: _Seal | None, kept: ChainHead | None, lines: Iterable[_Line]) -> Broken | None:
         number, before, earlier, at, found = 0, FIRST, FIRST, ("", 0), kept is None
-        for file, line, entry in self._lines():
+        for file, line, entry in lines:
             if isinstance(entry, str):
                 return Broken(file, line, entry)
             if seal is None:
@@ -212,7 +223,7 @@ class Audit:
     def _add(
         self, seal: _Seal, who: str, what: str, run: str | None, rig: str | None, details: Mapping[str, Any]
     ) -> None:
-        last = self._last or self._end(seal) or seal.anchor        # a broken end is never repaired
+        last = self._last or self._end(seal, self.entries()) or seal.anchor        # a broken end is never repaired
         at = now()
         entry = Entry(last.number + 1, at, who[:80], what, run, rig, details, last.hash)
         entry = replace(entry, hash=seal.hash_of(entry))
@@ -256,10 +267,11 @@ class Audit:
         plain = {"key": seal.key.hex(), "made": seal.made, "plain": seal.plain, **asdict(seal.anchor)}
         write_json(self._key_path, plain, mode=0o600)
 
-    def _end(self, seal: _Seal) -> ChainHead | None:
+    @staticmethod
+    def _end(seal: _Seal, entries: Iterable[Entry]) -> ChainHead | None:
         """Return the last line, if it is the anchor or follows it; None if the end is broken."""
         last: Entry | None = None
-        for entry in self.entries():
+        for entry in entries:
             last = entry
         if last is None:
             return seal.anchor if seal.anchor.number == 0 else None
@@ -269,11 +281,15 @@ class Audit:
             follows and hmac.compare_digest(seal.hash_of(last).encode(), last.hash.encode()))
         return found if good else None
 
-    def _lines(self) -> Iterator[tuple[str, int, Entry | str]]:
+    def _lines(self) -> Iterator[_Line]:
         for path in sorted(self._folder.glob("????-??.jsonl")):
             with path.open("rb") as file:
                 for line, text in enumerate(file, start=1):
                     yield path.name, line, _entry(text)
+
+
+def _readable(lines: Iterable[_Line]) -> Iterator[Entry]:
+    return (one for _, _, one in lines if isinstance(one, Entry))
 
 
 def _entry(text: bytes) -> Entry | str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -104,13 +105,19 @@ async def picture(site: Site, request: Request, body: None) -> Response:
 
 
 async def _shown(site: Site, run: str) -> tuple[ShownPicture, ...]:
-    from tdhil.report import pictures_in
-
     def look() -> tuple[ShownPicture, ...]:
         found = site.store.place(run) / "report.html"
-        return pictures_in(found.read_text("utf-8")) if found.is_file() else ()
+        return _pictures(found, found.stat().st_mtime_ns) if found.is_file() else ()
 
     return await off(look)
+
+
+@lru_cache(maxsize=4)
+def _pictures(report: Path, stamp_ns: int) -> tuple[ShownPicture, ...]:
+    """Return the pictures of a report. A page asks for each of them in a request of its own."""
+    from tdhil.report import pictures_in
+
+    return pictures_in(report.read_text("utf-8"))
 
 
 async def file_of(site: Site, request: Request, name: str, media: str, *, shown: bool = False) -> Response:

@@ -27,7 +27,7 @@ from tdhil.service.api_page import api_page
 from tdhil.service.languages import Language, language_of, languages
 from tdhil.service.limits import STOP_S
 from tdhil.service.middleware import off
-from tdhil.service.start_request import RigFile, limits_text, number_with_unit
+from tdhil.service.start_request import limits_text, number_with_unit
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -43,11 +43,13 @@ AS_RIG: Final = "as rig.yaml, else "
 """First part of the text of an empty field whose value the rig's file may state (`Option.form_hint`)."""
 
 
-def _stated(rig: RigFile) -> dict[str, Mapping[str, Any]]:
-    """Return the settings and the expected values that a run has without any request; none for an unusable rig."""
-    with suppress(TdhilError):
-        return {"settings": rig.way()[0].settings, "expected": {} if rig.rig is None else rig.rig.acceptance}
-    return {"settings": {}, "expected": {}}
+def _to_start(site: Site, rig: str) -> dict[str, Any]:
+    """Return the view of a rig, and the settings and the expected values that its run has without any request."""
+    found = site.supervisor.rigs.get(rig)
+    known: dict[str, Any] = {"rig": site.rig_view(found), "settings": {}, "expected": {}}
+    with suppress(TdhilError):                 # an unusable rig has none
+        known |= {"settings": found.way()[0].settings, "expected": {} if found.rig is None else found.rig.acceptance}
+    return known
 
 
 def _applies(language: Language, option: Option, settings: Mapping[str, Setting]) -> str | Markup:
@@ -143,9 +145,10 @@ class Pages:
             require(principal(request), role, route=request.url.path, open_here=not site.access.login)
             known: dict[str, Any] = {}
             for name, one in request.path_params.items():
-                known[name] = await off(partial(view_of[name], one))
-            if template == "start.html":
-                known |= await off(lambda: _stated(site.supervisor.rigs.get(request.path_params["rig"])))
+                if template == "start.html":
+                    known = await off(partial(_to_start, site, one))
+                else:
+                    known[name] = await off(partial(view_of[name], one))
             if template in ("rigs.html", "new_rig.html"):
                 known["folder"] = site.supervisor.rigs.folder is not None
                 known["built_in"] = await off(lambda: site.supervisor.rigs.built_in)

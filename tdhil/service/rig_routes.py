@@ -46,7 +46,7 @@ def routes(site: Site) -> list[Route]:
 
 async def rigs(site: Site, request: Request, body: None) -> list[RigView]:
     """Return every rig."""
-    return await off(lambda: [site.rig_view(one) for one in site.supervisor.all_rigs()])
+    return await off(lambda: site.rig_views(site.supervisor.all_rigs()))
 
 
 async def rig(site: Site, request: Request, body: None) -> RigView:

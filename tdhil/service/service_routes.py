@@ -51,7 +51,7 @@ async def audit(site: Site, request: Request, body: None) -> AuditView:
 
     def look() -> AuditView:
         book = site.supervisor.audit
-        entries, broken, head = list(book.entries()), book.verify(kept), book.head()
+        entries, broken, head = book.examined(kept)
         return AuditView(entries[-int(limit):][::-1], broken, None if head is None else str(head), book.made())
 
     return await off(look)
@@ -85,7 +85,7 @@ async def metrics(site: Site, request: Request, body: None) -> Response:
     found.rehearsed.set(rehearsed.count(True))
     found.viewers.set(site.feeds.viewers)
     found.relayed.set(site.relays)
-    views = await off(lambda: [site.rig_view(rig) for rig in site.supervisor.rigs.all()])
+    views = await off(lambda: site.rig_views(site.supervisor.rigs.all()))
     found.unsigned.set(sum(one.state == "blocked" for one in views))
     return Response(generate_latest(found.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 

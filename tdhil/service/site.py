@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sqlite3
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -173,8 +173,13 @@ class Site:
         self._documents.put(key, found)
         return found
 
-    def rig_view(self, rig: RigFile) -> RigView:
-        """Return the view of a rig, with its present user and its last run."""
+    def rig_views(self, rigs: Iterable[RigFile]) -> list[RigView]:
+        """Return the views of rigs. The files of the runs ahead of the index are read once for all of them."""
+        live = self._ahead_of_the_index()
+        return [self.rig_view(one, live) for one in rigs]
+
+    def rig_view(self, rig: RigFile, live: Mapping[str, Summary] | None = None) -> RigView:
+        """Return the view of a rig, with its present user and its last run. ``live``: rows ahead of the index."""
         run, blocked = self.supervisor.run_of(rig.id), self.supervisor.blocking_run(rig)
         if rig.rig is None:
             return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem, run=run, blocked_by=blocked)
@@ -188,26 +193,26 @@ class Site:
         holder = self.supervisor.holder(rig)
         state: Literal["free", "busy", "held", "blocked"]
         state = "busy" if run else "held" if holder else "blocked" if blocked else "free"
-        last = self.find_runs(RunFilter(rig.id, answered=True, rehearsal=False, uploaded=False), limit=1)
+        wanted = RunFilter(rig.id, answered=True, rehearsal=False, uploaded=False)
+        last = next(iter(self.find_runs(wanted, limit=1, live=live)), None)
         from tdhil.config import simulated_default_rig
 
         bench = simulated_default_rig(rig.rig) if simulated else rig.rig
         limits = None if bench.limits is None else bench.limits.model_dump()
         return RigView(
             rig.id, rig.name, state, simulated, rig.motion, problem, None if holder is None else str(holder), run,
-            blocked, drive, profile, limits, next(iter(last), None),
+            blocked, drive, profile, limits, last,
         )
 
     def find_runs(
         self, wanted: RunFilter, order: Order = NEWEST, *, limit: int = 100, offset: int = 0,
+        live: Mapping[str, Summary] | None = None,
     ) -> list[Summary]:
-        """Return runs from the index; from the files if the index is missing or out of date, as for a live run."""
-        return self._find_runs(self._ahead_of_the_index(), wanted, order, limit=limit, offset=offset)
+        """Return runs from the index; from the files if the index is missing or out of date, as for a live run.
 
-    def _find_runs(
-        self, live: Mapping[str, Summary], wanted: RunFilter, order: Order = NEWEST, *, limit: int, offset: int = 0,
-    ) -> list[Summary]:
-        """Return the same, with the rows of the runs that are ahead of the index."""
+        ``live``: the rows of the runs that are ahead of the index; None: they are read now.
+        """
+        live = self._ahead_of_the_index() if live is None else live
         ahead = [one for one in live.values() if wanted.contains(one)]
         first = max(0, offset - len(ahead))        # rows of live runs move a row of the index by their number at most
         try:
@@ -225,9 +230,9 @@ class Site:
             choices = self.supervisor.index.choices()
         except (sqlite3.Error, OSError):
             choices = {"rig": set(), "verdict": set(), "tags": set()}
-        found = self._find_runs(live, wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS)
+        found = self.find_runs(wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS, live=live)
         newest = wanted.until or next(
-            (one.id for one in self._find_runs(live, RunFilter(archived=True), limit=1)), None)
+            (one.id for one in self.find_runs(RunFilter(archived=True), limit=1, live=live)), None)
         rigs = choices["rig"] | {one.rig for one in live.values() if one.rig}
         return RunsPageView(
             found, total, page, max(1, -(-total // PAGE_RUNS)), (page - 1) * PAGE_RUNS + 1 if found else 0, newest,
@@ -322,16 +327,16 @@ class Site:
     def broker_messages(self) -> dict[str, Any]:
         """Return the messages for a broker, by topic: each rig's state and latest result."""
         found: dict[str, Any] = {}
-        for rig in self.supervisor.all_rigs():
-            view, run = self.rig_view(rig), None
+        for view in self.rig_views(self.supervisor.all_rigs()):
+            run = None
             if view.run is not None:
                 with suppress(NotThere):
                     status = self.store.status(view.run)
                     run = {"id": view.run, "state": status.state.value, "stage": status.stage, "since": status.at,
                            "rehearsal": self.store.rehearsed(view.run)}
-            here = f"rigs/{quote(rig.id, safe='')}"
+            here = f"rigs/{quote(view.id, safe='')}"
             found[f"{here}/state"] = {
-                "rig": rig.id, "name": view.name, "state": view.state, "simulated": view.simulated,
+                "rig": view.id, "name": view.name, "state": view.state, "simulated": view.simulated,
                 "holder": view.holder, "blocked_by": view.blocked_by, "run": run,
             }
             if view.last is not None:

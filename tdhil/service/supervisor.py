@@ -128,7 +128,7 @@ class Supervisor:
         self._command = command or (lambda folder: [sys.executable, "-m", "tdhil.service.run_process", str(folder)])
         self._asking = threading.Lock()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
-        self._live: dict[str, None] = {}               # in the order of their start
+        self._live: dict[str, str] = {}                # the rig of each, in the order of their start
         self._console = Console(store, say)
         self._lost: set[str] = set()
         self._stops: dict[str, tuple[str, str]] = {}   # (who, when) requested the stop of a suspended run
@@ -154,7 +154,7 @@ class Supervisor:
             with suppress(Exception):
                 status = self.store.status(run)
                 if not status.ended:
-                    self._live[run] = None
+                    self._live[run] = status.rig
                 elif status.state is State.STOP_NOT_CONFIRMED:
                     self._unconfirmed[run] = status
         self._in_background(lambda: self._audited(self.audit.begin))
@@ -219,17 +219,16 @@ class Supervisor:
     def all_rigs(self) -> list[RigFile]:
         """Return all rigs, and those without a file that a run keeps, as `rig`."""
         found = {one.id: one for one in self.rigs.all()}
-        for run in (*self.live(), *tuple(self._unconfirmed)):
+        for name in {*self._live.values(), *(one.rig for one in tuple(self._unconfirmed.values()))} - {"", *found}:
             with suppress(NotThere):
-                if (name := self.store.request(run).rig) and name not in found:
-                    found[name] = self.rig(name)
+                found[name] = self.rig(name)
         return [one for _, one in sorted(found.items())]
 
     def run_of(self, rig_id: str) -> str | None:
         """Return the present run of a rig."""
-        for run in self.live():
+        for run, rig in tuple(self._live.items()):
             with suppress(NotThere):
-                if self.store.request(run).rig == rig_id and not self.store.status(run).ended:
+                if rig == rig_id and not self.store.status(run).ended:
                     return run
         return None
 
@@ -263,7 +262,7 @@ class Supervisor:
                                                      now(), simulated, rig.motion, key))
             run = request.id
             try:
-                self._begin(run)
+                self._begin(request)
             except OSError as error:
                 reported = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
                 with suppress(OSError):
@@ -537,8 +536,8 @@ class Supervisor:
 
     # -- supervision of the runs ---------------------------------------------------------------------------------
 
-    def _begin(self, run: str) -> None:
-        folder = self.store.place(run)
+    def _begin(self, request: StoredRequest) -> None:
+        run, folder = request.id, self.store.place(request.id)
         life = take_life(folder)
         try:
             with (folder / "process.log").open("ab") as said:
@@ -548,7 +547,7 @@ class Supervisor:
                 )
         finally:
             os.close(life)
-        self._live[run] = None
+        self._live[run] = request.rig
 
     def _look(self) -> None:
         looks = 0

@@ -18,11 +18,13 @@ import jsonschema
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
+from tdhil import report
 from tdhil.config import STATED, form_options, load_rig
 from tdhil.config.options import OPTION, OPTIONS, Form
 from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
 from tdhil.runner.stages.speed import mean_speeds
+from tdhil.service import start_request
 from tdhil.service.limits import API
 from tdhil.service.run_filter import RunFilter
 from tdhil.service.run_state import State
@@ -295,6 +297,61 @@ def test_rehearsals_are_counted_for_themselves_and_marked(client, call, service)
     assert "tdhil_rehearsals_live 1.0" in text and "tdhil_rehearsals_asked_total 1.0" in text
     assert call("GET", f"/runs/{run}", 200)["rehearsal"] and call("GET", "/runs", 200)[0]["rehearsal"]
     assert service.web.broker_messages()["rigs/a/state"]["run"]["rehearsal"] is True
+
+
+# -- what one page reads
+
+
+def counted(monkeypatch, owner, name):
+    """Count the calls of a function, which goes on as before."""
+    calls, real = [], getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *given, **named: (calls.append(given), real(*given, **named))[1])
+    return calls
+
+
+def test_a_page_computes_the_way_to_a_rig_once_and_a_later_one_again(client, call, monkeypatch):
+    calls = counted(monkeypatch, start_request, "connection_of")
+    for _ in range(2):
+        calls.clear()
+        assert client.get("/start/real").status_code == 200
+        assert len(calls) == 1
+    calls.clear()
+    usable = [one for one in call("GET", "/rigs", 200) if one["state"] != "unusable"]
+    assert len(calls) == len(usable) == 6
+
+
+def test_the_list_of_rigs_reads_the_files_of_a_live_run_once(call, service, monkeypatch):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    service.index.wait_until_made(HANGS_S)
+    wait_for("the index", lambda: [one.id for one in service.index.find()] == [run])
+    summaries, requests = (counted(monkeypatch, service.store, name) for name in ("summary", "request"))
+    assert {one["id"]: one["run"] for one in call("GET", "/rigs", 200)}["a"] == run
+    assert len(summaries) == len(requests) == 1
+
+
+def test_the_pictures_of_a_page_are_read_once_and_again_once_the_report_is_made_again(call, service, monkeypatch):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    path = service.store.place(run) / "report.html"
+    figure = "<figure><svg></svg><figcaption>{}</figcaption></figure>"
+    reads = counted(monkeypatch, report, "pictures_in")
+    for caption in ("one", "two"):
+        reads.clear()
+        path.write_text(f"<h2>Fit</h2>{figure.format(caption)}<h2>Rest</h2>{figure.format('rest')}", "utf-8")
+        found = call("GET", f"/runs/{run}/pictures", 200)
+        assert [one["caption"] for one in found] == [caption, "rest"]
+        for number in range(2):
+            call("GET", f"/runs/{run}/pictures/{number}", 200)
+        assert len(reads) == 1
+
+
+def test_the_page_of_the_audit_reads_the_chain_once(call, service, monkeypatch):
+    service.audit.note("anna", "asked")
+    reads = counted(monkeypatch, service.audit, "_lines")
+    found = call("GET", "/audit", 200)
+    assert found["head"] == str(service.audit.head()) and found["broken"] is None and found["entries"]
+    assert len(reads) == 2             # the second one is this test's own head
 
 
 # -- one run
