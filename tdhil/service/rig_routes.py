@@ -81,7 +81,7 @@ def _file_view(found: RigFile) -> RigFileView:
 async def plan(site: Site, request: Request, body: dict[str, Any]) -> PlanView:
     """Plan a run. No drive is connected."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
-    options = options_of(body)
+    options = await off(lambda: options_of(body, found))
     _, connection = await off(lambda: found.way(options))
     asked = {"rig_file": str(found.path.resolve()), "options": options,
              "profile": hashlib.sha256(connection.profile.model_dump_json().encode()).hexdigest()}
@@ -137,7 +137,7 @@ async def start(site: Site, request: Request, body: dict[str, Any]) -> tuple[int
         require_motion(found)
         if not who.known:
             require_unwatched(found)
-        require_options(who, options_of(body))
+        require_options(who, options_of(body, found))
 
     await off(check)
     asked = await off(lambda: site.supervisor.start_run(which, body, who.name, key, address_of(request)))

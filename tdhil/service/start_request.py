@@ -53,8 +53,11 @@ _NAMES: Final = {one.flag.removeprefix("--").replace("-", "_"): one.name for one
 """Option names by the names of their flags."""
 
 
-def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options by name. Raises NotAllowed with the option, or ValuesWrong with all wrong values."""
+def options_of(asked: Mapping[str, Any], rig: RigFile | None = None) -> dict[str, Any]:
+    """Return the options by name. Raises NotAllowed with the option, or ValuesWrong with all wrong values.
+
+    ``rig``: the rig of the run. The simulator of its bus decides which faults can be rehearsed.
+    """
     found: dict[str, Any] = {}
     wrong: list[tuple[str, str]] = []
     for given, value in asked.items():
@@ -72,10 +75,12 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
             found[name] = value_of(TAKEN[name], value)
         except UsageError as error:
             wrong.append((name, error.what))
-    try:
-        expectations_of({}, RunDetails.of(found).expect)
-    except UsageError as error:
-        wrong.append((OPTION["expect"].name, error.what))
+    for text in RunDetails.of(found).expect:
+        try:
+            expectations_of({}, [text])
+        except UsageError as error:
+            wrong.append((OPTION["expect"].name, error.what))
+    wrong += _wrong_faults(found.get("fault") or (), rig)
     wrong += [(name, limits_in_words(OPTION.get(name), found.get(name)) or text) for name, text in wrong_values(found)]
     require_right(wrong)
     return found
@@ -128,6 +133,24 @@ class ValuesWrong(UsageError):
         self.fields = tuple(wrong)
         (name, what), *more = wrong
         super().__init__("; ".join((what, *(f"{other}: {text}" for other, text in more))), where=name)
+
+
+def _wrong_faults(texts: Sequence[str], rig: RigFile | None) -> list[tuple[str, str]]:
+    """Return the faults that the simulator of the rig's bus can't script; none for a rig whose file can't be used."""
+    from tdhil.buses import bus_named
+
+    wrong: list[tuple[str, str]] = []
+    if rig is None or not texts:
+        return wrong
+    with suppress(UsageError, DataFileError):
+        bus = bus_named(rig.way()[1].drive)
+        for text in texts:
+            try:
+                bus.parse_faults([text])
+            except TdhilError as error:
+                step = error.next_step.replace("--fault list shows", "The page Rehearse lists")
+                wrong.append(("fault", f"{error.what}. {step}"))
+    return wrong
 
 
 def require_right(wrong: Sequence[tuple[str, str]]) -> None:
@@ -379,18 +402,6 @@ def require_unwatched(rig: RigFile) -> None:
         where = (rig.rig and rig.rig.source("service.motion")) or rig.path.name
         raise NotAllowed("this rig moves only while a logged-in user watches it (service.motion: watched)",
                          where=where, next_step="Log in. On a service without accounts set motion: attended")
-
-
-def require_faults(texts: Sequence[str], drive: str) -> None:
-    """Refuse faults that the simulator of this bus can't script. Raises ValuesWrong."""
-    from tdhil.buses import bus_named
-
-    try:
-        if texts:
-            bus_named(drive).parse_faults(texts)
-    except TdhilError as error:
-        step = error.next_step.replace("--fault list shows", "The page Rehearse lists")
-        raise ValuesWrong([("fault", f"{error.what}. {step}")]) from None
 
 
 def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None = None) -> RunRequest:

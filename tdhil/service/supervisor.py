@@ -54,7 +54,6 @@ from tdhil.service.start_request import (
     edited,
     is_as_it_was,
     options_of,
-    require_faults,
     require_motion,
     require_new_rig,
 )
@@ -238,11 +237,10 @@ class Supervisor:
         """Start a run. Raises NotThere, NotAllowed, UsageError, DataFileError, NoRoom for a full disk, and Conflict
         with the holder. ``address``: the client's.
         """
-        options = options_of(asked)
         rig = self.rigs.get(rig_id)
+        options = options_of(asked, rig)
         require_motion(rig)
-        _, connection = rig.way(options)       # contradictions and wrong faults are reported now, not by the run
-        require_faults(options.get("fault") or (), connection.drive)
+        rig.way(options)                       # contradictions are reported now, not by the run
         with self._asking:
             if key is not None and (before := self.store.request_with_key(rig_id, key, who)) is not None:
                 if dict(before.options) != options:

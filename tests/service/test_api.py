@@ -299,6 +299,19 @@ def test_rehearsals_are_counted_for_themselves_and_marked(client, call, service)
     assert service.web.broker_messages()["rigs/a/state"]["run"]["rehearsal"] is True
 
 
+def test_a_wrong_fault_is_said_with_all_other_mistakes(call, service):
+    """It was said only once the others were corrected, and a plan did not say it at all."""
+    asked = {"seed": "x", "fault": ["sto@nowhere", "sto@hold", "no-such-fault"], "max_time_s": -5.0,
+             "expect": ["nonsense", "weight=1±1"]}
+    for way in ("runs", "plan"):
+        fields = call("POST", f"/rigs/a/{way}", 422, json=asked)["fields"]
+        assert [one["option"] for one in fields] == ["seed", "expect", "expect", "fault", "fault", "max_time_s"]
+        assert [one["message"].split(".")[0] for one in fields[3:5]] == [
+            "'nowhere' is no moment", "no fault is called 'no-such-fault'"]
+        assert fields[4]["message"].endswith("The page Rehearse lists them")
+    assert service.store.ids() == []
+
+
 # -- what one page reads
 
 

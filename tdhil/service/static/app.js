@@ -287,13 +287,24 @@
     return found;
   }
 
-  /** Mark the fields whose values were refused, each with its reason, and go to the first one if `go`. `said`: a reason of this page. */
+  /** Mistakes in the order of their fields on the form; those without a field come last. */
+  function inOrder(form, fields) {
+    const all = [...form.elements], place = (one) => (form.elements[one.option] ? all.indexOf(form.elements[one.option]) : all.length);
+    return [...fields].sort((one, other) => place(one) - place(other));
+  }
+  /** Mark a field as wrong. The text with this id describes it, before its help. */
+  function invalid(field, id) {
+    field.setAttribute("aria-invalid", "true");
+    field.setAttribute("aria-describedby", field.dataset.about ? `${id} ${field.dataset.about}` : id);
+  }
+  /** Mark the fields whose values were refused, each with its reasons, and go to the first one if `go`. `said`: a reason of this page. */
   function markWrong(form, fields, go = true) {
-    const known = fields.filter((one) => form.elements[one.option]);
+    const known = inOrder(form, fields.filter((one) => form.elements[one.option]));
     known.forEach((one) => {
-      const field = form.elements[one.option], note = el("span", { class: "alarm wrong", id: `wrong-${one.option}` }, one.said ?? worded(one.message));
-      field.setAttribute("aria-invalid", "true");
-      field.setAttribute("aria-describedby", note.id);
+      const field = form.elements[one.option], id = `wrong-${one.option}`, why = one.said ?? worded(one.message), before = form.querySelector(`[id="${id}"]`);
+      if (before) { before.append(`\n${why}`); return; }
+      const note = el("span", { class: "alarm wrong", id }, why);
+      invalid(field, id);
       (field.closest("label") || field).append(note);
       opens(field);
     });
@@ -310,8 +321,7 @@
     const mine = [...form.querySelectorAll("[data-flag]")].filter((one) => message.includes(`“${one.dataset.label}”`));
     const fields = mine.map((one) => (one.name ? one : one.querySelector("[name]")));
     fields.forEach((one) => {
-      one.setAttribute("aria-invalid", "true");
-      one.setAttribute("aria-describedby", said.id);
+      invalid(one, said.id);
       opens(one);
     });
     if (fields.length && go) focus(fields[0]);
@@ -473,7 +483,7 @@
       byId("plan").hidden = true;            // the plan of other values
       if (fields.length) {
         show(byId("said"), el("div", { class: "alarm", role: "alert" }, el("p", {}, fields.length === 1 ? tr("One value can't be used. Nothing was started.") : tr("{count} values can't be used. Nothing was started.", { count: fields.length })),
-          el("ul", {}, ...fields.map((one) => el("li", {}, el("strong", {}, word(one.label)), ": ", worded(one.message))))));
+          el("ul", {}, ...inOrder(form, fields).map((one) => el("li", {}, el("strong", {}, word(one.label)), ": ", worded(one.message))))));
         markWrong(form, fields);
         return;
       }

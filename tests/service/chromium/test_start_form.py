@@ -86,6 +86,30 @@ def test_all_wrong_values_of_the_start_form_are_said_at_once(page, served):
     assert [one.get_attribute("name") for one in marked.all()] == ["tolerance"]
 
 
+def test_all_mistakes_are_said_in_the_order_of_the_form_and_the_keyboard_is_at_the_first(page, served):
+    """The service names a limit last, and two faults of one field. Each wrong field is described by its reasons."""
+    page.goto("/start/a")
+    page.get_by_text("Simulated rig", exact=True).click()
+    page.locator("#motion > summary").click()
+    for name, text in (("fault", "no-such-fault, sto@nowhere"), ("amplitude_rad_s", "fast"), ("tolerance", "-5")):
+        page.locator(f"[name={name}]").fill(text)
+    for button in ("Start", "Plan"):
+        page.get_by_role("button", name=button).click()
+        page.get_by_role("alert").get_by_text("4 values can't be used").wait_for()
+        assert page.evaluate("document.activeElement.name") == "tolerance"
+        marked = page.locator("[aria-invalid=true]").all()
+        assert [one.get_attribute("name") for one in marked] == ["tolerance", "amplitude_rad_s", "fault"]
+        said = [page.locator(", ".join(f'[id="{name}"]' for name in one.get_attribute("aria-describedby").split()))
+                .all_inner_texts() for one in marked]
+        assert [len(texts) for texts in said] == [1, 2, 1] and all(all(texts) for texts in said)      # with the help
+        assert "no fault is called 'no-such-fault'" in said[2][0] and "'nowhere' is no moment" in said[2][0]
+        listed = page.locator("#said li strong").all_inner_texts()
+        assert listed == [page.locator("label", has=page.locator(f"[name={name}]")).get_attribute("data-label")
+                          for name in ("tolerance", "amplitude_rad_s", "fault", "fault")]
+        page.get_by_role("heading", name="Limits").click()             # the keyboard is elsewhere again
+    assert served.service.store.ids() == []
+
+
 def test_a_run_by_the_clock_says_first_whether_this_computer_holds_its_rate(page, served, monkeypatch):
     """A computer under load is named before Start; a second Start goes on. Unasked, a simulated run is stepped."""
     found = {"rate_hz": 100.0, "cycles": 150, "late": 12, "worst_s": 0.03, "holds": False,
