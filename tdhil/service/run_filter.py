@@ -35,6 +35,7 @@ class Summary:
     customer: str | None = None
     order_number: str | None = None
     place: str | None = None
+    acceptance: str | None = None          # verdict on the expected values; None without any
 
     def contains(self, text: str) -> bool:
         """Return whether every word of ``text`` occurs in a text of this row, in upper or lower case."""
@@ -48,7 +49,7 @@ class Summary:
         return " ".join(str(kept[name] or "") for name in SEARCHED).casefold()
 
 
-SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", *STATED, "tags")
+SEARCHED: Final = ("id", "rig", "state", "asked", "asked_by", "verdict", "acceptance", *STATED, "tags")
 """Columns of `Summary` in which a search finds text."""
 
 
@@ -57,7 +58,7 @@ SEARCHED_COLUMN: Final = "searched"
 """Column of the index with the text of a row in lower case, so that a search calls no function for each row."""
 SORTS: Final = {
     "id": ("id",), "rig": ("rig",), "state": ("state",), "inertia_kg_m2": ("inertia_kg_m2",), "verdict": ("verdict",),
-    "note": ("operator", "note"),
+    "acceptance": ("acceptance",), "note": ("operator", "note"),
 }
 """Keys by which a list can be sorted, with their columns."""
 
@@ -80,6 +81,7 @@ class RunFilter:
     answered: bool = False
     rehearsal: bool | None = None
     uploaded: bool | None = None
+    acceptance: str | None = None
 
     def contains(self, one: Summary) -> bool:
         """Return whether a row meets the conditions."""
@@ -89,6 +91,7 @@ class RunFilter:
             and (self.archived or not one.archived) and (self.until is None or one.id <= self.until)
             and (one.inertia_kg_m2 is not None or not self.answered)
             and self.rehearsal in (None, one.rehearsal) and self.uploaded in (None, one.uploaded)
+            and self.acceptance in (None, one.acceptance)
         )
 
     def sql(self, without: Iterable[str] = ()) -> tuple[str, list[str | bool]]:
@@ -97,7 +100,7 @@ class RunFilter:
         values: list[str | bool] = []
         for text, value in (
             ("rig = ?", self.rig), ("state = ?", self.state), ("verdict = ?", self.verdict),
-            ("rehearsal = ?", self.rehearsal), ("uploaded = ?", self.uploaded),
+            ("rehearsal = ?", self.rehearsal), ("uploaded = ?", self.uploaded), ("acceptance = ?", self.acceptance),
             ("instr(', ' || tags || ', ', ', ' || ? || ', ')", self.tag), ("id <= ?", self.until),
             *((f"instr({SEARCHED_COLUMN}, ?)", word.casefold()) for word in self.text.split()),
             *(("id <> ?", one) for one in without),

@@ -86,13 +86,12 @@ def _filter(request: Request) -> RunFilter:
     """Return the conditions on the runs of a list. Raises UsageError."""
     query = request.query_params
     if (state := query.get("state")) is not None and state not in set(State):
-        raise UsageError(f"{state[:40]!r} is not a state", where="state",
-                         next_step=f"States: {', '.join(State)}", entry=MessageCode.REQUEST_WRONG)
-    for name in ("text", "rig", "verdict", "tag", "until"):
+        raise request_wrong(f"{state[:40]!r} is not a state", "state", f"States: {', '.join(State)}")
+    for name in ("text", "rig", "verdict", "tag", "until", "acceptance"):
         if len(query.get(name, "")) > LONGEST_SEARCH:
             raise request_wrong(f"must be at most {LONGEST_SEARCH} characters", name)
     return RunFilter(query.get("rig"), state, query.get("verdict"), query.get("tag"), query.get("text", ""),
-                     asks_for(request, "archived"), query.get("until"))
+                     asks_for(request, "archived"), query.get("until"), acceptance=query.get("acceptance"))
 
 
 def asks_for(request: Request, what: str) -> bool:

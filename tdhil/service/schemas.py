@@ -270,7 +270,7 @@ class TrendView:
 class RunsPageView:
     """A page of the list of runs. ``total``: number of runs that meet the conditions; ``first``: number of the first
     run on this page, 0 for an empty page. ``until``: id for the next request, so that new runs move no page. ``rigs``,
-    ``verdicts``, ``tags``: the values that occur, for a choice.
+    ``verdicts``, ``tags``, ``acceptances``: the values that occur, for a choice.
     """
 
     runs: list[Summary]
@@ -282,6 +282,7 @@ class RunsPageView:
     rigs: list[str]
     verdicts: list[str]
     tags: list[str]
+    acceptances: list[str]
 
 
 @dataclass(frozen=True)
@@ -692,8 +693,8 @@ _ARCHIVED: Final = {"archived": "true: archived runs too"}
 _LEFT_OUT: Final = {**_ARCHIVED, "rehearsals": "true: rehearsals of faults too"}
 _RUN_FILTER: Final = {
     "rig": "runs of this rig only", "state": "runs in this state only", "verdict": "runs with this verdict only",
-    "tag": "runs with this tag only",
-    "text": "runs with these words in id, rig, state, time, user, verdict, operator, note,"
+    "tag": "runs with this tag only", "acceptance": "runs with this verdict on their expected values only",
+    "text": "runs with these words in id, rig, state, time, user, verdict, acceptance, operator, note,"
     " customer, order number, place or tags",
     "until": "runs up to this id only", **_ARCHIVED,
 }

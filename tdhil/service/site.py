@@ -35,7 +35,7 @@ from tdhil.service.run_filter import NEWEST, Order, RunFilter, Summary
 from tdhil.service.run_state import NotThere, State, Status
 from tdhil.service.schemas import ReplayView, RigView, RunsPageView, RunView, adapter
 from tdhil.service.start_request import RigFile
-from tdhil.service.store import read_as, read_json
+from tdhil.service.store import CHOSEN, read_as, read_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.uploads import TRACE, Uploads
 from tdhil.session import Holder
@@ -229,14 +229,15 @@ class Site:
         try:
             choices = self.supervisor.index.choices()
         except (sqlite3.Error, OSError):
-            choices = {"rig": set(), "verdict": set(), "tags": set()}
+            choices = {name: set() for name in CHOSEN}
         found = self.find_runs(wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS, live=live)
         newest = wanted.until or next(
             (one.id for one in self.find_runs(RunFilter(archived=True), limit=1, live=live)), None)
         rigs = choices["rig"] | {one.rig for one in live.values() if one.rig}
         return RunsPageView(
             found, total, page, max(1, -(-total // PAGE_RUNS)), (page - 1) * PAGE_RUNS + 1 if found else 0, newest,
-            sorted(rigs), sorted(choices["verdict"]), sorted(choices["tags"], key=str.casefold))
+            sorted(rigs), sorted(choices["verdict"]), sorted(choices["tags"], key=str.casefold),
+            sorted(choices["acceptance"]))
 
     def _count_runs(self, live: Mapping[str, Summary], wanted: RunFilter) -> int:
         ahead = sum(wanted.contains(one) for one in live.values())

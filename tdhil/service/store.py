@@ -17,7 +17,7 @@ import secrets
 import shutil
 import sqlite3
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -153,6 +153,7 @@ def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any]
         inertia.get("repeatability_rel"), status.exit_code, request.rehearsal,
         request.uploaded is not None,
         tags=annotations.tags, archived=annotations.archived,
+        acceptance=((result or {}).get("acceptance") or {}).get("verdict"),
         **{name: annotations.text(name, request.options) or None for name in STATED},
     )
 
@@ -349,7 +350,9 @@ class Store:
 
 
 _COLUMNS: Final = tuple(Summary.__dataclass_fields__)
-_VERSION: Final = 6
+_VERSION: Final = 7
+CHOSEN: Final = ("rig", "verdict", "acceptance", "tags")
+"""Columns whose values a page offers as a choice."""
 BATCH: Final = 100
 """Runs that are written to the index under its lock at a time: 5 to 20 ms, after their files were read without it."""
 
@@ -389,13 +392,9 @@ class Index:
         ``conditions``: those of `RunFilter`, in place of ``wanted``. ``without``: ids of runs that are left out. During
         `rebuild`, the rows are those of the former index, or without one the newest so far.
         """
-        self._ensure()
         clause, values = (wanted or RunFilter(**conditions)).sql(without)
-        with self._lock, closing(self._open()) as base:
-            rows = base.execute(
-                f"select {', '.join(_COLUMNS)} from runs {clause} {order.sql} limit ? offset ?",
-                (*values, limit, offset),
-            ).fetchall()
+        rows = self._rows(f"select {', '.join(_COLUMNS)} from runs {clause} {order.sql} limit ? offset ?",
+                          (*values, limit, offset))
         found = []
         for row in rows:
             plain = dict(zip(_COLUMNS, row, strict=True))
@@ -406,18 +405,19 @@ class Index:
 
     def count(self, wanted: RunFilter, without: Collection[str] = ()) -> int:
         """Return the number of matching rows. Raises sqlite3.Error."""
-        self._ensure()
         clause, values = wanted.sql(without)
-        with self._lock, closing(self._open()) as base:
-            return int(base.execute(f"select count(*) from runs {clause}", values).fetchone()[0])
+        return int(self._rows(f"select count(*) from runs {clause}", values)[0][0])
 
     def choices(self) -> dict[str, set[str]]:
-        """Return the values of ``rig``, ``verdict`` and ``tags`` in the rows of all runs. Raises sqlite3.Error."""
+        """Return the values of the columns of `CHOSEN` in the rows of all runs. Raises sqlite3.Error."""
+        rows = self._rows(f"select distinct {', '.join(CHOSEN)} from runs")
+        found = {name: {str(row[place]) for row in rows if row[place]} for place, name in enumerate(CHOSEN)}
+        return {**found, "tags": {tag for text in found["tags"] for tag in text.split(", ")}}
+
+    def _rows(self, sql: str, values: Sequence[Any] = ()) -> list[Any]:
         self._ensure()
         with self._lock, closing(self._open()) as base:
-            found = {name: {str(value) for (value,) in base.execute(f"select distinct {name} from runs") if value}
-                     for name in ("rig", "verdict", "tags")}
-        return {**found, "tags": {tag for text in found["tags"] for tag in text.split(", ")}}
+            return base.execute(sql, values).fetchall()
 
     def wait_until_made(self, within_s: float) -> bool:
         """Wait for a rebuild in progress. Return whether the index has every run."""

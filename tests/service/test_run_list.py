@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import random
+import sqlite3
+from contextlib import closing
 from dataclasses import asdict, replace
 
 import pytest
@@ -11,16 +13,18 @@ import pytest
 from tdhil.fleet import FleetRow
 from tdhil.service import site as site_module
 from tdhil.service.run_filter import SORTS, Order, RunFilter, Summary
-from tdhil.service.run_state import Status
+from tdhil.service.run_state import Status, now
 from tdhil.service.store import Index, Store, StoredRequest, summary_of, write_json
 from tests.service.conftest import wait_for
 
 VERDICTS = (None, "valid", "valid_wide", "not_identifiable")
+ACCEPTANCES = (None, "pass", "fail", "cannot tell")
 FILTERS = (
     RunFilter(), RunFilter(archived=True), RunFilter(rig="b"), RunFilter(verdict="valid"), RunFilter(tag="bearing"),
     RunFilter(tag="bear"), RunFilter(text="anna 7"), RunFilter(rig="a", verdict="valid", tag="checked", text="RUN"),
     RunFilter(state="failed", until="20260101-000020-000000"), RunFilter(rehearsal=True), RunFilter(uploaded=False),
     RunFilter(answered=True, rehearsal=False, uploaded=False), RunFilter(rehearsal=False, uploaded=True),
+    RunFilter(acceptance="cannot tell"), RunFilter(text="cannot tell", archived=True),
 )
 ORDERS = [Order(key, down) for key in SORTS for down in (True, False)]
 
@@ -38,7 +42,8 @@ def rows(count: int = 40) -> list[Summary]:
             row, state=draw.choice(("done", "failed")), verdict=draw.choice(VERDICTS), inertia_kg_m2=value,
             rehearsal=draw.random() < 0.3, uploaded=draw.random() < 0.3,
             operator=draw.choice((None, "anna", "Berta", "Ada")), note=f"run {number}", archived=draw.random() < 0.2,
-            tags=tuple(draw.sample(("bearing", "checked", "Bear 2"), draw.randrange(3)))))
+            tags=tuple(draw.sample(("bearing", "checked", "Bear 2"), draw.randrange(3))),
+            acceptance=ACCEPTANCES[number % 4]))
     return found
 
 
@@ -80,7 +85,25 @@ def test_rows_without_a_value_come_last_in_both_orders(filled):
 def test_the_choices_are_all_values_that_occur(filled):
     index, _ = filled
     assert index.choices() == {"rig": set("abc"), "verdict": {one for one in VERDICTS if one},
+                               "acceptance": {one for one in ACCEPTANCES if one},
                                "tags": {"bearing", "checked", "Bear 2"}}
+
+
+def test_a_row_has_the_verdict_on_the_expected_values_of_its_result_also_in_an_index_of_before(tmp_path):
+    """An index that has no such column is made again from the files."""
+    store = Store(tmp_path)
+    store.prepare()
+    for number, result in enumerate(({"acceptance": {"verdict": "fail"}}, {"acceptance": None}, {}, None)):
+        request = StoredRequest(f"20260101-00000{number}-000000", "a", "x.yaml", "0" * 64, {}, "local", now(), True,
+                                "never")
+        (store.runs / request.id).mkdir()
+        store.begin(request)
+        if result is not None:
+            write_json(store.runs / request.id / "result.json", result)
+    with closing(sqlite3.connect(tmp_path / "index.sqlite")) as base, base:
+        base.execute("create table runs (id text primary key, rig, archived)")
+        base.execute("pragma user_version = 6")
+    assert [one.acceptance for one in Index(store).find()] == [None, None, None, "fail"]
 
 
 # -- over HTTP
@@ -103,13 +126,15 @@ def many(service, monkeypatch):
 @pytest.mark.parametrize("query", [
     "", "sort=inertia_kg_m2&order=asc", "sort=note&order=desc", "sort=verdict&order=asc&archived=true",
     "rig=a", "verdict=valid&sort=rig&order=asc", "tag=bearing&text=anna", "text=live&sort=state",
+    "acceptance=cannot tell", "rig=a&sort=acceptance&order=desc",
 ])
 def test_the_pages_of_a_list_have_every_run_once_and_in_order(call, many, query):
     first = call("GET", f"/runs/page?{query}", 200)
     pages = [call("GET", f"/runs/page?{query}&page={page + 1}&until={first['until']}", 200)
              for page in range(first["pages"])]
     asked = dict(one.split("=") for one in query.split("&") if one)
-    wanted = RunFilter(**{name: text for name, text in asked.items() if name in ("rig", "verdict", "tag", "text")},
+    wanted = RunFilter(**{name: text for name, text in asked.items()
+                          if name in ("rig", "verdict", "tag", "text", "acceptance")},
                        archived=asked.get("archived") == "true")
     order = Order(asked.get("sort", "id"), asked.get("order", "desc") == "desc")
     expected = [one.id for one in order.sorted(one for one in many if wanted.contains(one))]
@@ -117,6 +142,7 @@ def test_the_pages_of_a_list_have_every_run_once_and_in_order(call, many, query)
     assert {page["total"] for page in pages} == {len(expected)}
     assert [page["first"] for page in pages] == [10 * k + 1 if page["runs"] else 0 for k, page in enumerate(pages)]
     assert first["rigs"] == ["a", "b", "c"] and first["tags"] == ["Bear 2", "bearing", "checked"]
+    assert first["acceptances"] == ["cannot tell", "fail", "pass"]
     assert call("GET", f"/runs/page?{query}&page=99", 200)["runs"] == []
 
 
@@ -145,13 +171,14 @@ def test_without_an_index_the_pages_come_from_the_files(call, service, monkeypat
 
 
 @pytest.mark.parametrize("query", ["page=0", "page=1.5", "page=1000000000", "sort=asked_by", "order=up", "state=asleep",
-                                   "archived=perhaps", f"tag={'x' * 201}"])
+                                   "archived=perhaps", f"tag={'x' * 201}", f"acceptance={'x' * 201}"])
 def test_a_wrong_question_of_a_list_is_refused(call, query):
     call("GET", f"/runs/page?{query}", 422)
 
 
 def test_the_plain_list_has_the_same_conditions(call, many):
-    for wanted in (RunFilter(verdict="valid"), RunFilter(tag="bearing"), RunFilter(until=many[9].id)):
+    for wanted in (RunFilter(verdict="valid"), RunFilter(tag="bearing"), RunFilter(until=many[9].id),
+                   RunFilter(acceptance="pass")):
         query = "&".join(f"{name}={value}" for name, value in wanted.__dict__.items() if value)
         found = [one["id"] for one in call("GET", f"/runs?{query}", 200)]
         assert found == [one.id for one in many[::-1] if wanted.contains(one)]

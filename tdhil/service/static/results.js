@@ -341,16 +341,16 @@
       select.dataset.offered = JSON.stringify(all);
       select.value = now;
     }
-    const choices = (rigs, verdicts, found) => {
+    const choices = ({ rigs = [], verdicts = [], acceptances = [], tags: occurring = [] }) => {
       offer(form.elements.rig, rigs, nameOf);
-      offer(form.elements.verdict, verdicts, (one) => word(one, "verdict"));
-      offer(form.elements.tag, found);
+      for (const [select, values] of [[form.elements.verdict, verdicts], [form.elements.acceptance, acceptances]]) offer(select, values, (one) => word(one, "verdict"));
+      offer(form.elements.tag, occurring);
     };
     /** Show the list of an address: its fields, its order, its page. */
     function fromAddress() {
       query = new URLSearchParams(location.search);
       for (const one of named) if (one.type === "checkbox") one.checked = query.get(one.name) === "true"; else if (one.name === "text" || one.name === "state") one.value = query.get(one.name) || "";
-      choices(found ? found.rigs : [], found ? found.verdicts : [], found ? found.tags : []);
+      choices(found || {});
     }
     /** The address of this list with other values; without a value for null. */
     function addressOf(changes) {
@@ -374,8 +374,9 @@
         return el("tr", {}, el("td", { class: "pick" }, box),
           el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}`, "aria-label": name }, rig), " ", badge(one.simulated) || "", " ", rehearsal(one.rehearsal) || "", " ", uploaded(one.uploaded) || ""),
           el("td", {}, at), el("td", {}, STATES[one.state] || one.state), el("td", { class: "answer" }, inertia(one) || "–"), el("td", { class: `verdict ${VERDICTS[one.verdict] || ""}` }, one.verdict ? word(one.verdict, "verdict") : ""),
+          el("td", { class: `acceptance verdict ${one.acceptance ? ACCEPTED[one.acceptance] || "fair" : ""}`, "data-label": heads.find((head) => head.dataset.key === "acceptance").textContent }, one.acceptance ? word(one.acceptance, "verdict") : null),
           el("td", {}, people(one), ...(one.tags.length ? [" ", ...tags(one.tags)] : []), ...(one.archived ? [" ", el("span", { class: "badge" }, tr("ARCHIVED"))] : [])));
-      }) : [el("tr", {}, el("td", { colspan: 7, class: "dim" }, found.total ? tr("no run on this page") : filtered ? tr("no run matches") : tr("no run yet")))]));
+      }) : [el("tr", {}, el("td", { colspan: 8, class: "dim" }, found.total ? tr("no run on this page") : filtered ? tr("no run matches") : tr("no run yet")))]));
       const last = found.first + found.runs.length - 1;
       byId("position").textContent = found.runs.length ? found.total === 1 ? tr("1 run") : tr("Runs {first} to {last} of {total}", { first: found.first, last, total: found.total }) : "";
       turn.hidden = found.pages === 1 && found.page === 1;
@@ -393,7 +394,7 @@
       if (mine !== asking || now === shown) return;          // a later request is on its way; or keep the keyboard focus
       shown = now;
       found = next;
-      choices(found.rigs, found.verdicts, found.tags);
+      choices(found);
       draw();
     }
     const again = () => look().catch((error) => { if (error instanceof Refused) away(error.message); });

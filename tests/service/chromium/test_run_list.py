@@ -83,6 +83,36 @@ def test_search_filters_and_order_reach_runs_of_every_page(page, many):
     page.locator("th[aria-sort=ascending]").wait_for()
 
 
+def test_the_list_shows_sorts_and_filters_by_the_acceptance(page, many):
+    page.goto("/runs?archived=true")
+    page.get_by_text("Runs 1 to 100 of 250").wait_for()
+    newest = page.locator("#runs tr").locator("nth=0")
+    assert newest.locator("td.acceptance").inner_text() == (rows(RUNS)[-1].acceptance or "")
+    page.get_by_role("button", name="acceptance").click()
+    page.locator("th[aria-sort=ascending]").get_by_text("acceptance").wait_for()
+    page.locator("#runs tr").first.get_by_text("cannot tell").wait_for()
+    page.get_by_role("button", name="acceptance").click()
+    page.locator("th[aria-sort=descending]").get_by_text("acceptance").wait_for()
+    page.locator("#runs tr").first.get_by_text("pass", exact=True).wait_for()
+    page.get_by_label("Acceptance").select_option("fail")
+    page.wait_for_url("**acceptance=fail**")
+    expected = [one for one in rows(RUNS) if one.acceptance == "fail"]
+    page.get_by_text(f"Runs 1 to {len(expected)} of {len(expected)}").wait_for()
+    assert set(page.locator("td.acceptance").all_inner_texts()) == {"fail"}
+
+
+def test_on_a_phone_the_acceptance_has_its_name_and_a_run_without_one_has_no_line(page, many):
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.goto("/runs?archived=true")
+    page.get_by_text("Runs 1 to 100 of 250").wait_for()
+    cells = page.locator("td.acceptance").evaluate_all("""all => all.map((one) => [
+        one.textContent, one.getBoundingClientRect().height > 0, one.dataset.label,
+        getComputedStyle(one, "::before").content !== "none"])""")
+    assert {text for text, *_ in cells} == {"", "pass", "fail", "cannot tell"}
+    assert all(seen is bool(text) for text, seen, *_ in cells)
+    assert {tuple(named) for text, _, *named in cells if text} == {("acceptance", True)}
+
+
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_list_with_its_filters_fits(page, many, width):
