@@ -41,6 +41,8 @@ from tdhil.service.uploads import TRACE, Uploads
 from tdhil.session import Holder
 
 T = TypeVar("T")
+Ahead = Mapping[str, Summary | None]
+"""Rows of the runs that are ahead of the index, by id; None for a deleted run, whose entry the index still has."""
 STOPS: Final = 16
 """Number of threads for stops that are started in advance. Each further stop starts a thread of its own."""
 LEASES: Final = 8
@@ -178,7 +180,7 @@ class Site:
         live = self._ahead_of_the_index()
         return [self.rig_view(one, live) for one in rigs]
 
-    def rig_view(self, rig: RigFile, live: Mapping[str, Summary] | None = None) -> RigView:
+    def rig_view(self, rig: RigFile, live: Ahead | None = None) -> RigView:
         """Return the view of a rig, with its present user and its last run. ``live``: rows ahead of the index."""
         run, blocked = self.supervisor.run_of(rig.id), self.supervisor.blocking_run(rig)
         if rig.rig is None:
@@ -206,14 +208,14 @@ class Site:
 
     def find_runs(
         self, wanted: RunFilter, order: Order = NEWEST, *, limit: int = 100, offset: int = 0,
-        live: Mapping[str, Summary] | None = None,
+        live: Ahead | None = None,
     ) -> list[Summary]:
         """Return runs from the index; from the files if the index is missing or out of date, as for a live run.
 
         ``live``: the rows of the runs that are ahead of the index; None: they are read now.
         """
         live = self._ahead_of_the_index() if live is None else live
-        ahead = [one for one in live.values() if wanted.contains(one)]
+        ahead = [one for one in live.values() if one is not None and wanted.contains(one)]
         first = max(0, offset - len(ahead))        # rows of live runs move a row of the index by their number at most
         try:
             ended = self.supervisor.index.find(
@@ -233,23 +235,24 @@ class Site:
         found = self.find_runs(wanted, order, limit=PAGE_RUNS, offset=(page - 1) * PAGE_RUNS, live=live)
         newest = wanted.until or next(
             (one.id for one in self.find_runs(RunFilter(archived=True), limit=1, live=live)), None)
-        rigs = choices["rig"] | {one.rig for one in live.values() if one.rig}
+        rigs = choices["rig"] | {one.rig for one in live.values() if one is not None and one.rig}
         return RunsPageView(
             found, total, page, max(1, -(-total // PAGE_RUNS)), (page - 1) * PAGE_RUNS + 1 if found else 0, newest,
             sorted(rigs), sorted(choices["verdict"]), sorted(choices["tags"], key=str.casefold),
             sorted(choices["acceptance"]))
 
-    def _count_runs(self, live: Mapping[str, Summary], wanted: RunFilter) -> int:
-        ahead = sum(wanted.contains(one) for one in live.values())
+    def _count_runs(self, live: Ahead, wanted: RunFilter) -> int:
+        ahead = sum(one is not None and wanted.contains(one) for one in live.values())
         try:
             return ahead + self.supervisor.index.count(wanted, live)
         except (sqlite3.Error, OSError):
             return ahead + sum(wanted.contains(one) for one in self.store.summaries() if one.id not in live)
 
-    def _ahead_of_the_index(self) -> dict[str, Summary]:
+    def _ahead_of_the_index(self) -> Ahead:
         """Return the rows of the runs whose index entry is missing or out of date, from the files."""
-        found = {}
+        found: dict[str, Summary | None] = {}
         for run in self.supervisor.ahead_of_the_index():
+            found[run] = None
             with suppress(NotThere):
                 found[run] = self.store.summary(run)
         return found

@@ -369,6 +369,16 @@ def test_a_run_is_deleted_by_its_typed_id_with_its_files_alone_and_the_audit_kee
     assert not [one for one in service.said if run in one]              # no index entry is tried again for ever
 
 
+def test_a_deleted_run_is_in_no_list_also_before_the_index_is_written(call, service, monkeypatch):
+    run, other = ended(call, service), ended(call, service)
+    wait_for("the index", lambda: {one.id for one in service.index.find()} == {run, other})
+    monkeypatch.setattr(service.supervisor, "_index_later", lambda run: None)
+    call("POST", f"/runs/{run}/delete", 200, json={"confirm": run})
+    assert [one["id"] for one in call("GET", "/runs", 200)] == [other]
+    page = call("GET", "/runs/page", 200)
+    assert ([one["id"] for one in page["runs"]], page["total"]) == ([other], 1)
+
+
 @pytest.mark.heavy
 def test_what_moves_or_is_referred_to_is_not_deleted(call, service, rigs):
     moving = call.start("a", "hold")["id"]
