@@ -56,8 +56,10 @@ CONTROL_PERIOD_S = 0.002
 LEAST_LAG_S = 0.05         # of the reported speed and torque
 COUPLING_RIG = {"load": "none", "limits": {"speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 400.0,
                                            "time_s": 900.0, "quick_stop_rad_s2": 1.0, "watchdog_s": 0.5,
-                                           "probe_torque_nm": 100.0, "probe_travel_rad": 3.0}}
-"""rig.yaml of two masses on a coupling: without it, the simulated rig has a drill string, and steps are refused."""
+                                           "probe_torque_nm": 200.0, "probe_travel_rad": 3.0}}
+"""rig.yaml of two masses on a coupling: without it, the simulated rig has a drill string, and steps are refused. The
+torque of the sign probe is that of the simulated rig without a rig.yaml: friction is up to 80 N·m, and the shaft has to
+be accelerated."""
 RESONANCES_HZ, LOAD_SHARES, DAMPING_RATIOS = (3.0, 20.0), (0.2, 0.5), (0.02, 0.1)
 TWO_MASS = 100_000
 """Seeds from here on have a shaft of two masses."""

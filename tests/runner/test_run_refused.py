@@ -143,6 +143,17 @@ def test_a_locked_shaft_ends_the_probe(world):
     assert result.stop.confirmed
 
 
+def test_a_torque_above_that_of_the_probe_ends_it_in_speed_mode_and_is_named(world):
+    """The set speed does not rise while the torque is above the limit of the probe."""
+    here = world()
+    here.drive.misbehave = lambda drive, sample: sample._replace(
+        speed_rad_s=0.0, torque_nm=60.0 if drive.commands[-1].speed_rad_s > 0.3 else 0.0)
+    with pytest.raises(PreflightRefused, match="torque rose to 60 N·m, above") as error:
+        probe_sign(here.bench, replace(LIMITS, probe_torque_nm=50.0), Mode.SPEED, SPEED_RESOLUTION)
+    assert "raise limits.probe_torque_nm" in error.value.next_step
+    assert max(command.speed_rad_s for command in here.drive.commands) == pytest.approx(0.3, abs=0.01)
+
+
 def test_the_probe_goes_no_farther_than_it_may(world):
     """Reported speed is noise about zero while the shaft creeps."""
     here = world()

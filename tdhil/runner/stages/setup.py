@@ -52,11 +52,13 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
     threshold_rad_s = max(6.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
     recent: deque[float] = deque(maxlen=loop.cycles(0.1))
     travel_rad = 0.0
-    torque_nm = speed_rad_s = 0.0
-    strained = 0
+    torque_nm = speed_rad_s = highest_nm = 0.0
+    ramped = strained = 0
+    above = False           # the torque of the last cycle, in speed mode, over the limit of the probe
     before_s = loop.enable(mode, Command(mode, 0.0, 0.0)).time_s
-    for step in range(1, loop.cycles(RAMP_S + 2.0) + 1):
-        share = min(1.0, step * loop.period_s / RAMP_S)
+    for _ in range(loop.cycles(RAMP_S + 2.0)):
+        ramped += not above
+        share = min(1.0, ramped * loop.period_s / RAMP_S)
         if mode is Mode.TORQUE:
             torque_nm = share * limits.probe_torque_nm
         else:
@@ -77,9 +79,12 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
             raise _wrong_way(mean_rad_s)
         if mean_rad_s > threshold_rad_s:
             return torque_nm if mode is Mode.TORQUE else None
-        # In speed mode the drive itself raises the torque. Above the limit of the probe, the probe ends.
-        if mode is Mode.SPEED and abs(sample.torque_nm) > limits.probe_torque_nm > 0.0:
-            strained = strained + 1
+        # In speed mode the drive itself raises the torque. Above the limit of the probe the set speed does not rise,
+        # and the probe ends if the shaft is not seen to move within a short time.
+        above = mode is Mode.SPEED and abs(sample.torque_nm) > limits.probe_torque_nm > 0.0
+        if above:
+            highest_nm = max(highest_nm, abs(sample.torque_nm))
+            strained += 1
             if strained >= loop.cycles(TORQUE_SEEN_S):
                 break
         if abs(travel_rad) > limits.probe_travel_rad:
@@ -91,16 +96,17 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
                 entry=MessageCode.SIGN_NOT_CLEAR,
             )
     _end_torque(loop, mode)
-    raise PreflightRefused(
-        f"the shaft did not move up to the limit of {limits.probe_torque_nm:g} N·m"
-        if mode is Mode.TORQUE
-        else f"the shaft did not follow a speed of {speed_rad_s:.3f} rad/s",
-        where="sign probe",
-        next_step="Check that the brake is released, or raise limits.probe_torque_nm in rig.yaml"
-        if mode is Mode.TORQUE
-        else "Check the brake, the drive's enable input, and that its lowest speed is below this one",
-        entry=MessageCode.SHAFT_DID_NOT_MOVE,
-    )
+    to_release = "Check that the brake is released, or raise limits.probe_torque_nm in rig.yaml"
+    if mode is Mode.TORQUE:
+        what, next_step = f"the shaft did not move up to the limit of {limits.probe_torque_nm:g} N·m", to_release
+    elif above:
+        what = (f"the drive's torque rose to {highest_nm:.0f} N·m, above limits.probe_torque_nm of"
+                f" {limits.probe_torque_nm:g} N·m, before the shaft turned at {threshold_rad_s:.3g} rad/s")
+        next_step = to_release
+    else:
+        what = f"the shaft did not follow a speed of {speed_rad_s:.3f} rad/s"
+        next_step = "Check the brake, the drive's enable input, and that its lowest speed is below this one"
+    raise PreflightRefused(what, where="sign probe", next_step=next_step, entry=MessageCode.SHAFT_DID_NOT_MOVE)
 
 
 def _end_torque(loop: ControlLoop, mode: Mode) -> None:
