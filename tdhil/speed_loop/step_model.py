@@ -190,6 +190,7 @@ class StepModel:
         spring = SpringLoad(low_hz, high_hz, damping * stiffness_nm_rad / (pi * high_hz))
         return (1.0 - share) * inertia_kg_m2, spring
 
+    @np.errstate(over="ignore", invalid="ignore")     # a fit may try an unstable loop
     def reported(self, theta: Reals) -> Reals:
         """Return the reported response (N,) to alternating steps, as a share of the step."""
         from scipy.linalg import expm
@@ -208,12 +209,8 @@ class StepModel:
         whole = np.zeros((size + 1, size + 1))
         whole[:-1, :-1], whole[:-1, -1] = a, b
         first = min(length, max(0, ceil(delay_s / self.period_s - 1e-9)))     # a fit may try any delay
-        state = np.zeros(size + 1)
-        state[-1] = 1.0
-        with np.errstate(over="ignore", invalid="ignore"):
-            state = expm(whole * (first * self.period_s - delay_s)) @ state
-            out = np.r_[np.zeros(first), _outputs(expm(whole * self.period_s), np.append(c, 0.0), state,
-                                                  length - first)]
+        state = expm(whole * (first * self.period_s - delay_s))[:, -1]
+        out = np.r_[np.zeros(first), _outputs(expm(whole * self.period_s), np.append(c, 0.0), state, length - first)]
         response = out[:self.count] + 1.0 - out[self._apart:]
         return np.asarray(response + self._rounding(response, self.rounding_amplitude(theta)), dtype=np.float64)
 

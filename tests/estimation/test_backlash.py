@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from profiles import MessageCode
-from tdhil.estimation import Verdict, identify
+from tdhil.estimation import Verdict, backlash, identify
 from tests.estimation.angle_bench import COUNTS, OverAngle, run_over_angle
 from tests.estimation.stages_bench import Play
 
@@ -74,3 +74,20 @@ def test_too_few_angles_say_nothing():
     position = recording.position_rad.copy()
     position[np.arange(len(position)) % 500 != 0] = np.nan      # once in 2 s
     assert identify(replace(recording, position_rad=position)).backlash is None
+
+
+def test_a_decaying_oscillation_is_no_backlash():
+    """A string swings for minutes after a change of its mean speed, and not with the period."""
+    period_s, swing_hz, excited = 12.5, 0.176, tuple(range(1, 11))
+    time = np.arange(0.0, 8 * period_s, 0.05)
+    turned = 3.0 * time + 0.05 * np.exp(-0.02 * time) * np.cos(2.0 * math.pi * swing_hz * time)
+    lines = np.array([backlash._lines(time[k:k + 250], turned[k:k + 250], 0.0, period_s, 40)
+                      for k in range(0, len(time), 250)]).mean(axis=0)
+    segment = backlash._SegmentAngle(
+        period_s, 3.0, excited, lines, np.arange(11.0, 41.0), lines[10:], np.arange(11.0, 41.0) ** -2.0)
+    left = segment.settled(segment.rest[None])[0]
+    assert np.linalg.norm(left) < 0.05 * np.linalg.norm(segment.rest)
+    wave = np.arange(1.0, 41.0)
+    play = replace(segment, theta=np.where(wave < 11, 0.05 * np.exp(1.7j * wave) / wave, 0.0))
+    z = backlash._GapMotion.of(np.array([[5.0, 0.3, 0.0, 0.0]])).waves(play, 1000, np.zeros((10, 1)))[:, 10:]
+    assert np.linalg.norm(segment.settled(z)) > 0.8 * np.linalg.norm(z)
