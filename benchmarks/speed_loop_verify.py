@@ -197,8 +197,6 @@ def told(rows: Sequence[dict[str, Any]]) -> int:
     good = True
     for shaft in ("rigid", "two-mass"):
         own = [row for row in rows if row.get("shaft", "rigid") == shaft]
-        if not own:
-            continue
         some = [row for row in own if not row["refused"]]
         print(f"{shaft}: {len(own)} rigs")
         good &= met("refused by identify or tune speed", len(own) - len(some), len(own), most=MOST_REFUSED)
