@@ -26,6 +26,7 @@ from tdhil.errors import UsageError
 from tdhil.runner.stages.speed import mean_speeds
 from tdhil.service import start_request
 from tdhil.service.limits import API
+from tdhil.service.run_channel import lives
 from tdhil.service.run_filter import RunFilter
 from tdhil.service.run_state import State
 from tdhil.service.schemas import ROUTES, SOCKETS, document
@@ -491,6 +492,7 @@ def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(c
     watch = call("GET", f"/runs/{run}", 200)["watch"]
     assert watch["how"] == "hidden"
     assert watch["lost"] is not None
+    wait_for("its end", lambda: not lives(service.store.place(run)))      # until then it refuses by itself, 409
     call("POST", f"/runs/{run}/lease", 503, json={"key": later})
 
 
