@@ -28,6 +28,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -43,6 +44,11 @@ from tdhil.recording import FloatArray, Recording
 LEAST_GAIN = 40.0
 """Least decrease of −2 ln L by the two parameters of an order. For white noise the probability of as much by chance is
 e^(−20) for one order, and below 1e-6 for all of them."""
+
+LEAST_COUNTS = 0.02
+"""Least motion of the shaft by an order, counts of the angle, in the slowest segment. The rounding of the angle repeats
+with the angle, so that no fit averages it out: over an hour it made orders of 0.01 counts
+(`benchmarks/identify_speed.py`)."""
 
 MOST_ORDERS = 8
 """Most orders in one fit."""
@@ -66,6 +72,7 @@ _FINER = 2                # grid points for one sample, on which the harmonics p
 _SETTLED_S = 20.0         # s; after this time the longest filter has settled
 _SEEN_SHARE = 0.98        # share of the time in which an order must be inside the used band
 _BLOCK_S = 2.0            # s; blocks of time whose scores are independent: longer than load and filters remember
+_SAME_RAD = 1e-9          # rad: a smaller difference of two readings is rounding of the arithmetic
 _SMALL = 1e-12            # relative: smaller eigenvalues of the normal matrix count as zero
 
 
@@ -122,6 +129,13 @@ class _Angle:
         spline = CubicSpline.through(times, turned)
         return cls(spline, float(times[0]), float(times[-1]), times)
 
+    @property
+    def count_rad(self) -> float:
+        """Return one count of the angle, rad: the smallest difference of two of its steps; 0 if it is not seen."""
+        differences = np.diff(np.unique(np.diff(self.spline.at(self.times))))
+        counts = differences[differences > _SAME_RAD]
+        return float(counts.min()) if len(counts) else 0.0
+
     def at(self, time_s: FloatArray) -> FloatArray:
         """Return the angle (N,), rad."""
         return self.spline.at(time_s)
@@ -156,6 +170,10 @@ class _GridSegment:
     """Spectrum (K,) of the derivative of the angle."""
     angle_band: int
     """Number of the used frequencies at which the readings of the angle are close enough for its derivative."""
+    rate_rad_s: float
+    """Mean speed by the angle."""
+    count_rad: float
+    """Smallest step of the angle's readings."""
     kept: dict[int, tuple[ComplexArray, ComplexArray]] = field(default_factory=dict)
 
     def repeats(self, signal: FloatArray) -> FloatArray:
@@ -207,7 +225,9 @@ def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _GridSegment 
     chosen = slice(1, int(np.searchsorted(hertz, _USED_BAND / step)))
     blank = np.zeros(0, dtype=np.complex128)
     band = int(np.searchsorted(hertz[chosen], _ANGLE_BAND / usual_interval(angle.times)))
-    bare = _GridSegment(angle.at(time), taper, periods, hertz[chosen], chosen, blank, blank, blank, band)
+    turned = angle.at(time)
+    rate = float(turned[-1] - turned[0]) / float(time[-1] - time[0])
+    bare = _GridSegment(turned, taper, periods, hertz[chosen], chosen, blank, blank, blank, band, rate, angle.count_rad)
     return replace(bare, torque=bare.spectrum(torque), speed=bare.spectrum(speed),
                    turning=bare.spectrum(angle.speed(time)))
 
@@ -272,9 +292,10 @@ class _WeighedSegment:
 
 @dataclass(frozen=True)
 class _View:
-    """The segments as one model sees them."""
+    """The segments as one model sees them. ``impedance``: T/ω (K,) of its shaft at s (K,), N·m·s/rad."""
 
     seen: tuple[_WeighedSegment, ...]
+    impedance: Callable[[ComplexArray], ComplexArray]
 
     @classmethod
     def of(cls, segments: tuple[_GridSegment, ...], curve: ModelCurve, theta: FloatArray, delay_s: float) -> _View:
@@ -294,7 +315,14 @@ class _View:
                     if loud <= _LOUDER * quiet:
                         rest[begin:end] = by_angle[begin:end]
             found.append(_WeighedSegment(one, rest, through, np.ones(len(s))))
-        return cls(tuple(found))
+        return cls(tuple(found), partial(model.shaft.impedance, theta[: model.mechanical]))
+
+    def least_nm(self, order: int) -> float:
+        """Return the amplitude of an order that moves the shaft by `LEAST_COUNTS` where this needs least, N·m."""
+        segments = [seen.segment for seen in self.seen]
+        omega = order * np.array([abs(one.rate_rad_s) for one in segments])
+        impedance = np.abs(self.impedance(np.asarray(1j * omega, dtype=np.complex128)))
+        return LEAST_COUNTS * min(one.count_rad for one in segments) * float(np.min(impedance * omega))
 
     def weighted(self, torque: HarmonicTorque | None) -> tuple[_WeighedSegment, ...]:
         """Return the segments with the noise that is left without the harmonics found so far."""
@@ -344,13 +372,14 @@ def _robust(
     return found
 
 
-def _gains(torque: HarmonicTorque) -> FloatArray:
-    """Return the decrease of −2 ln L by each order (H,)."""
+def _gains(torque: HarmonicTorque, view: _View) -> FloatArray:
+    """Return the decrease of −2 ln L by each order (H,); 0 for an order that may be the rounding of the angle."""
     gains = []
-    for k in range(len(torque.orders)):
+    for k, order in enumerate(torque.orders):
         own = slice(2 * k, 2 * k + 2)
         part = torque.parts[own]
-        gains.append(float(part @ np.linalg.pinv(torque.covariance[own, own]) @ part))
+        gain = float(part @ np.linalg.pinv(torque.covariance[own, own]) @ part)
+        gains.append(gain if math.hypot(*part) >= view.least_nm(order) else 0.0)
     return np.array(gains)
 
 
@@ -394,16 +423,18 @@ def _search(view: _View) -> HarmonicTorque | None:
         seen = view.weighted(found)
         known = () if found is None else found.orders
         best: HarmonicTorque | None = None
+        most = 0.0
         for order in _candidates(seen, found):
             tried = _fit(seen, (*known, order))
-            if _gains(tried)[-1] > LEAST_GAIN and (best is None or _gains(tried)[-1] > _gains(best)[-1]):
-                best = tried
+            gain = float(_gains(tried, view)[-1])
+            if gain > max(LEAST_GAIN, most):
+                best, most = tried, gain
         if best is None:
             break
         found = _fit(view.weighted(best), best.orders)
     if found is None:
         return None
-    kept = tuple(n for n, gain in zip(found.orders, _gains(found), strict=True) if gain > LEAST_GAIN)
+    kept = tuple(n for n, gain in zip(found.orders, _gains(found, view), strict=True) if gain > LEAST_GAIN)
     return _fit(view.weighted(found), kept) if kept else None
 
 
