@@ -28,8 +28,9 @@ TITLES = {
     "speed_limit_reverse": "speed limit, reverse", "quick_stop_time": "quick-stop ramp",
     "quick_stop_deceleration": "quick-stop ramp",
 }
-_SLACK = 1e-6
-"""Relative difference from 32-bit rounding, or from half a count, that does not count as wider."""
+"""`set_to` of a profile's parameter → title of its row in preflight."""
+FLOAT_ROUNDING = 1e-6
+"""Relative difference below which two values count as equal: above the rounding of a 32-bit float, 6e-8."""
 
 
 class OwnLimits:
@@ -70,5 +71,5 @@ class OwnLimits:
         """Return whether writing ``wanted`` over ``found`` would widen the drive's own limit."""
         wanted, found = abs(wanted), abs(found)
         if limit == QUICK_STOP:
-            return wanted < found * (1.0 - _SLACK)
-        return wanted > found * (1.0 + _SLACK)
+            return wanted < found * (1.0 - FLOAT_ROUNDING)
+        return wanted > found * (1.0 + FLOAT_ROUNDING)

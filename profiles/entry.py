@@ -63,9 +63,9 @@ def unit_text(unit: str) -> str:
     return _UNIT_TEXTS.get(unit, unit)
 
 
-def with_unit(value: float, unit: str) -> str:
-    """Return the value of a drive's parameter with its unit."""
-    return f"{value:.10g} {unit_text(unit)}".strip()
+def with_unit(value: float, unit: str, digits: int = 10) -> str:
+    """Return the value of a drive's parameter with its unit, in so many significant digits at most."""
+    return f"{value:.{digits}g} {unit_text(unit)}".strip()
 
 
 # ---------------------------------------------------------------------------------------------------------------------

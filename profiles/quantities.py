@@ -40,7 +40,7 @@ def _scaled(value: float, times: float, over: float) -> float:
 
 SPEED: Final = Unit("speed", "rad/s")
 RPM: Final = Unit("speed", "rpm", _TURN, 60.0)
-RAD_S_PER_RPM: Final = RPM.si(1.0)
+RAD_S_PER_RPM: Final = RPM.si(1.0)        # rad/s
 ACCELERATION: Final = Unit("acceleration", "rad/s²")
 ANGLE: Final = Unit("angle", "rad")
 TORQUE: Final = Unit("torque", "N·m")

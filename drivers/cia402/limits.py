@@ -9,16 +9,13 @@ from drivers.cia402.objects import Objects, name
 from drivers.cia402.process_data import decode_value, encode_value
 from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
-from drivers.own_limits import LIMIT_SET_BY, QUICK_STOP, SPEED, TITLES, TORQUE, OwnLimits
+from drivers.own_limits import FLOAT_ROUNDING, LIMIT_SET_BY, QUICK_STOP, SPEED, TITLES, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
 from profiles import Require, with_unit
 from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile, Parameter
 from profiles.quantities import RAD_S_PER_RPM
 
 QUICK_STOP_OPTION = 0x605A
-
-FLOAT_ROUNDING = 1e-6
-"""Permitted relative difference of a value from the required one: above the rounding of a 32-bit float, 6e-8."""
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of the drive that the profile names: read, compared with the required values, and used as scales.
@@ -155,7 +152,6 @@ def _set(
     """Write one parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
     where, mend = name(one.index, one.sub), one.advice or ""
     limit, title = LIMIT_SET_BY[one.set_to or ""], TITLES[one.set_to or ""]
-    unit = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s"}.get(one.unit, "")
     wished = {
         "torque_limit": f"{limits.torque_nm:g} N·m", "torque_limit_reverse": f"{-limits.torque_nm:g} N·m",
         "speed_limit": f"{limits.speed_rad_s:g} rad/s", "speed_limit_reverse": f"{-limits.speed_rad_s:g} rad/s",
@@ -168,6 +164,9 @@ def _set(
         def shown(data: bytes) -> float:
             return decode_value(one.type, data, where) * per_lsb
 
+        def in_unit(data: bytes) -> str:
+            return with_unit(shown(data), one.unit, 6)
+
         def braking(value: float) -> float:
             """Convert the time of a ramp to its deceleration; a time of 0 means no ramp."""
             if one.from_speed is None:
@@ -177,12 +176,12 @@ def _set(
         if own.stays(limit, braking(shown(wanted)), braking(shown(before))):
             si = abs(shown(before)) * {"rpm": RAD_S_PER_RPM, "rated": rated_nm}.get(one.unit, 1.0)
             objects.stands[one.index, one.sub] = before
-            own.keep(table, limit, title, wished, f"{shown(before):.6g}{unit}", si, where)
+            own.keep(table, limit, title, wished, in_unit(before), si, where)
             return
         back = objects.change_bytes(one.index, one.sub, wanted)
         own.written(
-            table, limit, title, wished, f"{shown(back):.6g}{unit}", f"{shown(before):.6g}{unit}", back == wanted,
-            where, mend, wider=own.wider(limit, braking(shown(wanted)), braking(shown(before))),
+            table, limit, title, wished, in_unit(back), in_unit(before), back == wanted, where, mend,
+            wider=own.wider(limit, braking(shown(wanted)), braking(shown(before))),
         )
     except PreflightRefused as error:
         table.checks.append(

@@ -19,7 +19,6 @@ from profiles.quantities import RAD_S_PER_RPM
 # Value of one count, in SI at the motor shaft: parameters' values first, then the scale of every signal. Pure.
 
 
-
 @dataclass(frozen=True)
 class Scales:
     """SI for one count: rad/s or N·m."""

@@ -228,7 +228,6 @@ class RegisterSetting(NamedTuple):
     per_count: float
 
 
-
 def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits,
                rated_nm: float,
                found: Parameters, own: OwnLimits) -> None:

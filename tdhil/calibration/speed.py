@@ -126,8 +126,6 @@ def calibrate_by_position(
     return _concluded("position", value, budget, wanted, confidence, None)
 
 
-
-
 def _concluded(
     method: str, value: float, budget: tuple[SpeedBudgetLine, ...], wanted: float, confidence: float, least: int | None,
 ) -> SpeedCalibration:

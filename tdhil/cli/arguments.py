@@ -41,6 +41,13 @@ share = amount(SHARE)
 LARGEST_VALUE: Final = 1e9
 """Largest value of a quantity of a calibration, in its unit of SI. A larger one is a typing error."""
 
+
+def require_inertia(flag: str, value: float | None, *, zero: bool = False) -> None:
+    """Raise UsageError for a stated inertia that is not positive; ``zero``: 0 is allowed too."""
+    if value is not None and not ((value > 0.0 or (zero and value == 0.0)) and value <= LARGEST_VALUE):
+        raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
+
+
 PICTURES: Final = (".png", ".svg", ".pdf")
 """Endings of a picture's file."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from profiles.quantities import INERTIA
-from tdhil.cli.arguments import LARGEST_VALUE, add_option, amount, share
+from tdhil.cli.arguments import add_option, amount, require_inertia, share
 from tdhil.cli.calibrate_reference import WITHOUT_BODY, require_new, run_without_body
 from tdhil.cli.calibrate_speed import add_speed_arguments
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
@@ -135,8 +135,8 @@ Wanted = list[tuple[Path, float, float | None]]
 def _wanted(namespace: argparse.Namespace) -> Wanted:
     """Return (log, body, its standard uncertainty) of each run. Raises UsageError for impossible values."""
     logs, added = namespace.logs, namespace.added
-    _positive("--added", added)
-    _positive("--added-sd", namespace.added_sd, zero=True)
+    require_inertia("--added", added)
+    require_inertia("--added-sd", namespace.added_sd, zero=True)
     bodies: Wanted = []
     for text in namespace.body:
         name, equals, value = text.rpartition("=")
@@ -147,8 +147,8 @@ def _wanted(namespace: argparse.Namespace) -> Wanted:
             equals = ""
         if not equals or not name:
             raise UsageError(f"{text[:60]!r} is not FILE=J", where="--body", next_step="Such as --body with.mcap=55.0")
-        _positive("--body", body[1], zero=True)
-        _positive("--body", body[2], zero=True)
+        require_inertia("--body", body[1], zero=True)
+        require_inertia("--body", body[2], zero=True)
         bodies.append(body)
     if added is None:
         if namespace.added_sd is not None:
@@ -160,11 +160,6 @@ def _wanted(namespace: argparse.Namespace) -> Wanted:
         raise UsageError(f"takes two logs, without the body and with it, not {len(logs)}", where="--added",
                          next_step=f"Such as: {_EXAMPLE}; more bodies with --body FILE=J")
     return [(logs[0], 0.0, 0.0), (logs[1], added, namespace.added_sd), *bodies]
-
-
-def _positive(flag: str, value: float | None, *, zero: bool = False) -> None:
-    if value is not None and not ((value > 0.0 or (zero and value == 0.0)) and value <= LARGEST_VALUE):
-        raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
 
 
 def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]:
@@ -188,8 +183,8 @@ def _plan(namespace: argparse.Namespace) -> int:
         if getattr(namespace, name) is not None:
             raise UsageError("is for a body of known inertia, not for another reference",
                              where=f"--plan, --{name.replace('_', '-')}", next_step="Leave one of them out")
-    _positive("--added", namespace.added)
-    _positive("--added-sd", namespace.added_sd, zero=True)
+    require_inertia("--added", namespace.added)
+    require_inertia("--added-sd", namespace.added_sd, zero=True)
     require_file(namespace.logs[0])
     record = read_recorded(namespace, namespace.logs[0])
     sd_share = ASSUMED_BODY_REL_SD

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from profiles.quantities import INERTIA
-from tdhil.cli.arguments import LARGEST_VALUE, amount, hide_rare
+from tdhil.cli.arguments import amount, hide_rare, require_inertia
 from tdhil.config import OPTION, load_rig, resolve
 from tdhil.errors import ExitCode, UsageError, existing_file
 
@@ -34,9 +34,7 @@ def check_calibrate(namespace: argparse.Namespace) -> None:
     for flag, value in (("--added", namespace.added), ("--added-sd", namespace.added_sd)):
         if value is not None and not namespace.calibrate:
             raise UsageError("is for a calibration", where=flag, next_step=f"Such as: {_EXAMPLE}")
-        zero = flag == "--added-sd" and value == 0.0
-        if value is not None and not ((value > 0.0 or zero) and value <= LARGEST_VALUE):
-            raise UsageError(f"{value:g}: must be a positive number of kg·m²", where=flag)
+        require_inertia(flag, value, zero=flag == "--added-sd")
     if not namespace.calibrate:
         return
     if namespace.added is None:

@@ -52,5 +52,3 @@ def _asked() -> str | None:
     from tdhil.config import LONGEST_NAME
 
     return visible(sys.stdin.readline().strip())[:LONGEST_NAME] or None
-
-

@@ -116,6 +116,8 @@ class _Angle:
     begin_s: float
     end_s: float
     times: FloatArray
+    count_rad: float
+    """One count of the readings: the smallest difference of two of their steps; 0 if none is seen."""
 
     @classmethod
     def of(cls, recording: Recording) -> _Angle | None:
@@ -127,14 +129,9 @@ class _Angle:
         if len(times) < _BAND_BINS or not np.all(np.diff(times) > 0.0):
             return None
         spline = CubicSpline.through(times, turned)
-        return cls(spline, float(times[0]), float(times[-1]), times)
-
-    @property
-    def count_rad(self) -> float:
-        """Return one count of the angle, rad: the smallest difference of two of its steps; 0 if it is not seen."""
-        differences = np.diff(np.unique(np.diff(self.spline.at(self.times))))
+        differences = np.diff(np.unique(np.diff(turned)))
         counts = differences[differences > _SAME_RAD]
-        return float(counts.min()) if len(counts) else 0.0
+        return cls(spline, float(times[0]), float(times[-1]), times, float(counts.min()) if len(counts) else 0.0)
 
     def at(self, time_s: FloatArray) -> FloatArray:
         """Return the angle (N,), rad."""
@@ -173,7 +170,7 @@ class _GridSegment:
     rate_rad_s: float
     """Mean speed by the angle."""
     count_rad: float
-    """Smallest step of the angle's readings."""
+    """One count of the angle's readings."""
     kept: dict[int, tuple[ComplexArray, ComplexArray]] = field(default_factory=dict)
 
     def repeats(self, signal: FloatArray) -> FloatArray:

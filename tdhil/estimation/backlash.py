@@ -96,7 +96,7 @@ class _SegmentAngle:
     """Angle of one segment at H harmonics of its period, means over P periods.
 
     ``theta`` (H,): the reported angle, rad; ``rest`` (U,): that at the unexcited harmonics ``unexcited`` (U,), without
-    the part that the reported torque explains; ``variance`` (U,): E|·|² of its noise.
+    the part that the reported torque explains, and without a decaying motion; ``variance`` (U,): E|·|² of its noise.
     """
 
     period_s: float
@@ -185,7 +185,7 @@ class _AllSegments:
 
     @property
     def rest(self) -> ComplexArray:
-        return np.concatenate([one.settled(one.rest[None])[0] for one in self.segments])
+        return np.concatenate([one.rest for one in self.segments])
 
     @property
     def still(self) -> _Lines:
@@ -361,9 +361,10 @@ def _angle_of(
     free = ~np.isin(harmonics, excited)
     mean = rest.mean(axis=0)
     scatter = np.sum(np.abs(rest - mean) ** 2, axis=0)[free] / (len(rest) - 1)
-    return _SegmentAngle(
+    seen = _SegmentAngle(
         segment.period_s, segment.offset_rad_s, excited, table.mean(axis=0), harmonics[free], mean[free],
         _smoothed(harmonics[free], scatter, len(rest) - 1) / len(rest))
+    return replace(seen, rest=seen.settled(seen.rest[None])[0])
 
 
 def _lines(time: FloatArray, signal: FloatArray, start_s: float, period_s: float, highest: int) -> ComplexArray:

@@ -31,7 +31,7 @@ from tdhil.recording import Excitation, FloatArray, Recording, Segment
 
 
 LIMIT_SHARE = 0.005       # largest share of excited samples at a limit; that share biases the line fit by about as much
-AT_LIMIT = 0.98          # share of the torque limit that counts as at the limit
+AT_LIMIT = 0.98           # share of the torque limit that counts as at the limit
 _LEAST_FLAT = 5           # fewest samples of a flat top
 _NOISY_RATIO, _SMOOTH_RATIO = 3.0, 20.0    # share at the extreme over that one step below: above it a top is suspect
 _NOISY = 0.8              # steps; samples within _NEAR of the top are noisy if their mean second difference is larger

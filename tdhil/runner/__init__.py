@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         MEAN_SPEED_SHARES as MEAN_SPEED_SHARES, MachineLimits as MachineLimits, StopRequest as StopRequest,
     )
     from tdhil.runner.speed_check import speed_warnings as speed_warnings
+    from tdhil.runner.speed_steps_program import step_record as step_record
     from tdhil.runner.stage_log import stage_warnings as stage_warnings
     from tdhil.runner.stages import course_of as course_of, plan_steps_before as plan_steps_before
     from tdhil.runner.stop import not_confirmed as not_confirmed
@@ -45,6 +46,7 @@ else:
         "preconditions": "WARM_UP precondition_warnings refuse_by_plan stops_from_torque_mode",
         "settings": "ControlAssumptions ExcitationRequest MEAN_SPEED_SHARES MachineLimits StopRequest",
         "speed_check": "speed_warnings",
+        "speed_steps_program": "step_record",
         "stage_log": "stage_warnings",
         "stages": "course_of plan_steps_before",
         "stop": "not_confirmed",

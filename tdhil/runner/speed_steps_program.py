@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
 from drivers import Command, Mode
+from tdhil.recording import Recording
 from tdhil.runner.programs import Run, Turning, begin_motion, switch_to_torque, turn
 from tdhil.runner.stages import (
     STEPS_RESERVE_S,
@@ -84,12 +86,18 @@ def acquire_steps(run: Run, case: StepCase, program: StepProgram, turning: Turni
 
 def _found_so_far(run: Run, case: StepCase, program: StepProgram, starts_s: list[float]) -> StepVerification | str:
     """Compare the steps so far, while the shaft turns at the lower speed. Return a text if that is not possible."""
-    recording = run.log.recording(complete=True)
-    record = StepRecord(
-        recording.time_s, recording.speed_rad_s, recording.fresh, recording.limited, tuple(starts_s),
-        run.loop.period_s, recording.timing_half_width_s, run.task.request.reference_filter_s)
+    record = step_record(run.log.recording(complete=True), tuple(starts_s), run.loop.period_s,
+                         run.task.request.reference_filter_s)
     command = Command(Mode.SPEED, program.low_rad_s, 0.0)
     return run.loop.compute(partial(_compared, case, program, record), command)
+
+
+def step_record(
+    recording: Recording, starts_s: Sequence[float], period_s: float, reference_filter_s: float
+) -> StepRecord:
+    """Return the part of a recording that a comparison of the steps uses."""
+    return StepRecord(recording.time_s, recording.speed_rad_s, recording.fresh, recording.limited, starts_s, period_s,
+                      recording.timing_half_width_s, reference_filter_s)
 
 
 def _compared(case: StepCase, program: StepProgram, record: StepRecord) -> StepVerification | str:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from drivers.canopen.quick_stop import CanopenTarget
-from drivers.cia402.limits import FLOAT_ROUNDING
 from drivers.drive import Mode, Outcome
+from drivers.own_limits import FLOAT_ROUNDING
 from profiles.canopen import CanopenProfile
 from profiles.entry import Require
 from profiles.library import load_canopen_profile

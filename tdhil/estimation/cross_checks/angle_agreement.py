@@ -25,7 +25,7 @@ from tdhil.recording import Recording
 _END_S = 0.5              # s; time at either end of a stretch over which its speed is averaged
 _LEAST_S = 2.0            # s; least duration of a stretch
 _LEAST_READINGS = 8       # fewest readings of the angle in a stretch
-RATIOS_ALIKE = 0.02             # largest relative difference between the ratios of two stages, as both are rounded
+RATIOS_ALIKE = 0.02       # largest relative difference between the ratios of two stages, as both are rounded
 
 
 @dataclass(frozen=True)

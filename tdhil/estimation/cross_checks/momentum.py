@@ -164,7 +164,7 @@ def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]
 # knot of length a covary by D a/6, since ∫ u (1 − u) du = 1/6.
 
 
-LONGEST_GAP_S = 0.3      # s; longest time without a sample
+LONGEST_GAP_S = 0.3       # s; longest time without a sample
 _CHUNK = 65_536           # samples worked on at once, to limit the memory for a long row
 
 

@@ -19,7 +19,7 @@ from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01     # p-value below which the rows scatter more than the operating points
-LEAST_DOF = 3.0          # least degrees of freedom of a scatter that is used
+LEAST_DOF = 3.0           # least degrees of freedom of a scatter that is used
 _BEND_SHOWS = 6.6         # of the density: decrease that shows nonlinear friction, χ² of one degree at 1 %
 _UNSEEN_BEND = 0.03       # of J: standard deviation of the effect of undetected nonlinear friction on a balance
 _LEAST_CHANGE = 0.1       # of the highest speed: rows with a smaller change of speed determine J too poorly

@@ -152,7 +152,7 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
 # model (`sandwich`).
 
 
-LEAST_DOF = 3.0          # least degrees of freedom for the quantile
+LEAST_DOF = 3.0           # least degrees of freedom for the quantile
 _SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))   # start values of the shapes of both filters
 _EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # κ of two equal poles, and the distance that counts as equal to it
 

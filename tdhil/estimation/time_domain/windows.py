@@ -34,7 +34,7 @@ from tdhil.recording import BoolArray, FloatArray
 _MOST_SAMPLES = 200_000   # most samples of a recording that are used: more are averaged in groups
 _LEAST_RATE_HZ = 50.0     # Hz; least rate after this averaging
 _STILL_SHARE = 0.04       # of the highest speed: below it the shaft may be at standstill
-STILL_QUANTA = 3.0       # quanta of the speed below which the shaft stands still
+STILL_QUANTA = 3.0        # quanta of the speed below which the shaft stands still
 _GAP_STEPS = 4.5          # missing samples in a row that a straight line bridges
 _GAP_S = 0.05             # s; a shorter interval is no gap
 _LEAST_SAMPLES_OF_STRETCH = 32   # fewer samples make no stretch

@@ -142,7 +142,6 @@ class CoveragePlant:
 # notes, scaled to the torque and speed of the others.
 
 
-
 RPM = RAD_S_PER_RPM
 FIELD_NOISE = PlantNoise(3.0, 0.5, 10.0, 0.02, 0.003, 2.0, 0.1 * RPM, 1.0)
 

@@ -131,8 +131,6 @@ def changed(settings: LoopSettings, **values: object) -> LoopSettings:
 # References of the loop, in rad/s: sine with offset (equation 8), step (equation 9), chirp, multisine.
 
 
-
-
 class Reference(Protocol):
     """Reference speed for every time; ``period_s`` is None without a period."""
 

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 # Plot of a sweep, as in figures 9, 10, 12 and 13: waveforms, amplitude difference, gain and phase.
 
 
-
 _SHOWN_PERIODS = 2.0
 
 
