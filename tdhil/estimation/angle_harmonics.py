@@ -56,6 +56,11 @@ MOST_ORDERS = 8
 HIGHEST_ORDER = 256
 """Highest order tested."""
 
+LOOK_POINTS = 65_536
+"""Most points of a segment's grid in which orders are sought first, over its first whole periods. They are 11 minutes
+at 100 Hz and 2 at 500 Hz, more than any segment of the study has (`benchmarks/harmonics_of_angle.py`). The rest of a
+longer segment is used if an order stands out here."""
+
 _BINS = 4096              # bins of a turn, in which the angle is sorted for the first look
 _FIRST_LOOK = 0.5         # of LEAST_GAIN: least gain in the first look, which is approximate, for the exact one
 _MOST_RATE_HZ = 500.0     # Hz; a faster recording is averaged down to it
@@ -120,9 +125,9 @@ class _Angle:
     """One count of the readings: the smallest difference of two of their steps; 0 if none is seen."""
 
     @classmethod
-    def of(cls, recording: Recording) -> _Angle | None:
-        """Return the angle; None if the drive reports none, or hardly any."""
-        readings = angle_readings(recording)
+    def of(cls, recording: Recording, spans: Sequence[tuple[float, float]]) -> _Angle | None:
+        """Return the angle over spans of time, s; None if the drive reports none, or hardly any."""
+        readings = angle_readings(recording, spans)
         if readings is None:
             return None
         times, turned = readings
@@ -199,13 +204,30 @@ def _run(index: tuple[int, ...]) -> tuple[int, int]:
     return begin, end - 1
 
 
+def _first_periods(stretch: Stretch) -> Stretch:
+    """Return the first periods of a stretch, up to `LOOK_POINTS`; the stretch itself if it has no more."""
+    if not stretch.index:
+        return stretch
+    first, last = _run(stretch.index)
+    interval = max(usual_interval(stretch.periods[first].time_s), 1.0 / _MOST_RATE_HZ)
+    most = max(LEAST_PERIODS, int(LOOK_POINTS * interval / stretch.segment.period_s))
+    if last - first < most:
+        return stretch
+    return replace(stretch, periods=stretch.periods[first : first + most], index=stretch.index[first : first + most])
+
+
+def _span(stretch: Stretch) -> tuple[float, float]:
+    """Return begin and end of the longest run of periods of a stretch, s."""
+    first, last = (stretch.index[k] for k in _run(stretch.index))
+    begin = stretch.segment.start_s + first * stretch.segment.period_s
+    return begin, begin + (last - first + 1) * stretch.segment.period_s
+
+
 def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _GridSegment | None:
     if not stretch.index:
         return None
-    first, last = (stretch.index[k] for k in _run(stretch.index))
-    periods, period_s = last - first + 1, stretch.segment.period_s
-    begin = stretch.segment.start_s + first * period_s
-    end = begin + periods * period_s
+    period_s, (begin, end) = stretch.segment.period_s, _span(stretch)
+    periods = round((end - begin) / period_s)
     inside = samples.between(begin - 1e-9, end - 1e-9)
     if periods < LEAST_PERIODS or not angle.covers(begin, end, LONGEST_GAP / max(stretch.segment.lines_hz)):
         return None
@@ -448,16 +470,17 @@ class _AngleLines:
     turning: ComplexArray
 
     @classmethod
-    def of(cls, case: PeriodicCase, angle: _Angle) -> _AngleLines:
+    def of(cls, case: PeriodicCase, stretches: Sequence[Stretch], angle: _Angle) -> _AngleLines:
+        """Return the lines over the periods of the stretches, which are those of the case or a part of them."""
         rates, speeds, turnings = [], [], []
-        for stretch, fit in zip(case.stretches, case.fits, strict=True):
+        for whole, stretch, fit in zip(case.stretches, stretches, case.fits, strict=True):
             if not len(fit.speed):
                 continue
             omega = 2.0 * np.pi * np.array(fit.lines_hz)
             times = [period.time_s for period in stretch.periods]
             own = np.array([_lines(time, angle.speed(time), stretch.segment.start_s, omega) for time in times])
             rates.append(omega)
-            speeds.append(fit.speed.mean(axis=0))
+            speeds.append(fit.speed[np.isin(whole.index, stretch.index)].mean(axis=0))
             turnings.append(own.mean(axis=0))
         return cls(np.concatenate(rates), np.concatenate(speeds), np.concatenate(turnings))
 
@@ -501,14 +524,14 @@ class _FittedShaft:
         return cls(curve, theta, tuple(free), covariance, *lines.delay(theta[curve.fitted.problem.model.mechanical :]))
 
 
-def _fitted(lines: _AngleLines, segments: tuple[_GridSegment, ...], model: _FittedShaft) -> HarmonicTorque | None:
+def _fitted(seen: _SeenAngle, model: _FittedShaft) -> HarmonicTorque | None:
     """Return the harmonics beside a model, with the model's part in their covariance; None without any."""
-    found = _search(_View.of(segments, model.curve, model.theta, model.delay_s))
+    found = _search(seen.view(model))
     if found is None:
         return None
 
     def parts(theta: FloatArray, delay_s: float) -> FloatArray:
-        view = _View.of(segments, model.curve, theta, delay_s)
+        view = seen.view(replace(model, theta=theta, delay_s=delay_s))
         return _fit(view.weighted(found), found.orders).parts
 
     covariance = found.covariance.copy()
@@ -520,7 +543,7 @@ def _fitted(lines: _AngleLines, segments: tuple[_GridSegment, ...], model: _Fitt
         if root[column] > 0.0:
             theta = model.theta.copy()
             theta[index] += _STEP * root[column]
-            delay_s, _ = lines.delay(theta[model.curve.fitted.problem.model.mechanical :])
+            delay_s, _ = seen.lines.delay(theta[model.curve.fitted.problem.model.mechanical :])
             slopes[:, column] = (parts(theta, delay_s) - found.parts) / (_STEP * root[column])
     return replace(found, covariance=covariance + slopes @ model.covariance @ slopes.T)
 
@@ -573,6 +596,31 @@ def _widened(
     return widened(finding, half, "harmonics of the angle", "their amplitudes and phases")
 
 
+@dataclass(frozen=True)
+class _SeenAngle:
+    """What is seen of the angle: as a function of time, on the grid of each segment, and at the excited lines."""
+
+    angle: _Angle
+    segments: dict[int, _GridSegment]
+    lines: _AngleLines
+
+    @classmethod
+    def of(cls, case: PeriodicCase, stretches: tuple[Stretch, ...]) -> _SeenAngle | None:
+        """Return the angle over the stretches of the case, or over a part of them; None if it is not known there."""
+        whole = stretches is case.stretches
+        spans = ((-math.inf, math.inf),) if whole else tuple(_span(one) for one in stretches if one.index)
+        angle = _Angle.of(case.recording, spans)
+        if angle is None:
+            return None
+        segments = {number: found for number, stretch in enumerate(stretches)
+                    if (found := _segment(stretch, case.samples, angle)) is not None}
+        return cls(angle, segments, _AngleLines.of(case, stretches, angle)) if segments else None
+
+    def view(self, model: _FittedShaft) -> _View:
+        """Return the segments as a fitted model sees them."""
+        return _View.of(tuple(self.segments.values()), model.curve, model.theta, model.delay_s)
+
+
 Again = Callable[[Samples], tuple[PeriodicCase, Finding]]
 """Function that identifies the recording with other samples."""
 
@@ -586,25 +634,26 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
     curve, raw = finding.curve, case.samples
     if not isinstance(curve, ModelCurve):
         return case, finding
-    angle = _Angle.of(case.recording)
-    if angle is None:
-        return case, finding
-    segments = {number: found for number, stretch in enumerate(case.stretches)
-                if (found := _segment(stretch, raw, angle)) is not None}
-    if not segments:
+    first = tuple(_first_periods(stretch) for stretch in case.stretches)
+    long = any(one is not stretch for one, stretch in zip(first, case.stretches, strict=True))
+    seen = _SeenAngle.of(case, first if long else case.stretches)
+    if seen is not None and long:
+        if _search(seen.view(_FittedShaft.of(seen.lines, curve))) is None:
+            return case, replace(finding, harmonics=())
+        seen = _SeenAngle.of(case, case.stretches)
+    if seen is None:
         return case, finding
     torque: HarmonicTorque | None = None
-    lines = _AngleLines.of(case, angle)
     for _ in range(_ROUNDS):
-        model = _FittedShaft.of(lines, curve)
-        torque = _fitted(lines, tuple(segments.values()), model)
+        model = _FittedShaft.of(seen.lines, curve)
+        torque = _fitted(seen, model)
         if torque is None:
             return case, replace(finding, harmonics=())
-        clean = replace(raw, torque_nm=raw.torque_nm - _through_filter(raw, angle, torque, model))
+        clean = replace(raw, torque_nm=raw.torque_nm - _through_filter(raw, seen.angle, torque, model))
         case, finding = again(clean)
         if not isinstance(finding.curve, ModelCurve):
             break
         curve = finding.curve
     assert torque is not None
-    finding = _widened(case, finding, segments, torque, model.delay_s)
+    finding = _widened(case, finding, seen.segments, torque, model.delay_s)
     return case, replace(finding, harmonics=torque.estimates(case.options.confidence))

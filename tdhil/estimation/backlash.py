@@ -37,6 +37,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,7 +50,7 @@ from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segm
 from tdhil.estimation.result import Backlash, Estimate, Refusal, normal_quantile
 from tdhil.estimation.samples import Samples, Stretch, angle_readings, thinned
 from tdhil.estimation.spectrum import ComplexArray
-from tdhil.recording import FloatArray, IntArray
+from tdhil.recording import FloatArray, IntArray, Segment
 
 LEAST_GAIN = 60.0
 """Least decrease of −2 ln L by a backlash. `benchmarks/backlash.py` has the largest gain of 500 shafts without one."""
@@ -65,6 +66,7 @@ _LEAST_BEYOND = 2         # times the highest excited harmonic: fewest harmonics
 _TRANSIENT_TERMS = 3      # powers of 1/(j ω) of a decaying motion; the next one is 1 % of the first at 5 times its rate
 _READINGS = 5             # readings of the angle for one harmonic, at least
 _POINTS = 8               # points for one harmonic that are kept of a recording with more
+_SAME_PERIODS = 1e-9      # periods; instants closer than this are the same: 1e-7 of a turn of the highest harmonic
 _NEIGHBOURS = 7           # harmonics on either side, over which the scatter is smoothed
 _STEPS = 1000             # steps of a period in which the motion between the flanks is computed
 _COARSE_STEPS = 400       # the same on the coarse grid
@@ -213,20 +215,17 @@ class _AllSegments:
         rest, noise = self.rest, np.concatenate([one.variance for one in self.segments])
         harmonics = np.concatenate([one.unexcited for one in self.segments])
         lowest = int(np.argmin(harmonics))
-        count = 1 if z is None else len(z)
-        best = _PlayLikelihood(np.full(count, math.inf), np.zeros(count), np.zeros((count, len(rest))))
-        for power, level in itertools.product(_SLOPES, _LEVELS):
-            variance = noise + level * noise[lowest] * (harmonics / harmonics[lowest]) ** (-2.0 * power)
-            value = np.full(count, 2.0 * float(np.sum(np.log(variance) + np.abs(rest) ** 2 / variance)))
-            size = np.zeros(count)
-            if z is not None:
-                energy = (np.abs(z) ** 2 / variance).sum(axis=1) + 1e-300
-                size = np.maximum((z.conj() * (rest / variance)).real.sum(axis=1) / energy, 0.0)
-                value = value - 2.0 * size**2 * energy
-            better = value < best.value
-            best = _PlayLikelihood(np.where(better, value, best.value), np.where(better, size, best.size),
-                               np.where(better[:, None], variance, best.variance))
-        return best
+        falling = (harmonics / harmonics[lowest]) ** (-2.0 * np.array(_SLOPES)[:, None])
+        variance = noise + np.reshape(noise[lowest] * _LEVELS[:, None] * falling[:, None], (-1, len(rest)))
+        value = 2.0 * np.sum(np.log(variance) + np.abs(rest) ** 2 / variance, axis=1)[None]
+        size = np.zeros_like(value)
+        if z is not None:
+            energy, product = (part @ (1.0 / variance).T for part in (np.abs(z) ** 2, (z.conj() * rest).real))
+            size = np.maximum(product / (energy + 1e-300), 0.0)
+            value = value - 2.0 * size**2 * energy
+        best = np.argmin(value, axis=1)
+        rows = np.arange(len(best))
+        return _PlayLikelihood(value[rows, best], size[rows, best], variance[best])
 
 
 @dataclass(frozen=True)
@@ -346,10 +345,8 @@ def _angle_of(
     if highest <= max(excited):
         return None
     harmonics = np.arange(1.0, highest + 1.0)
-    table = np.array([_lines(time[first:last], turned[first:last], segment.start_s, segment.period_s, highest)
-                      for first, last in spans])
-    torque = np.array([_lines(period.time_s, period.torque_nm, segment.start_s, segment.period_s, highest)
-                       for period in stretch.periods])
+    table = _lines([(time[first:last], turned[first:last]) for first, last in spans], segment, highest)
+    torque = _lines([(period.time_s, period.torque_nm) for period in stretch.periods], segment, highest)
     s: ComplexArray = np.asarray(2j * np.pi * harmonics / segment.period_s, dtype=np.complex128)
     lowest = min(excited) - 1
     rough = abs(complex(torque[:, lowest].mean() / (s[lowest] ** 2 * table[:, lowest].mean())))
@@ -367,18 +364,27 @@ def _angle_of(
     return replace(seen, rest=seen.settled(seen.rest[None])[0])
 
 
-def _lines(time: FloatArray, signal: FloatArray, start_s: float, period_s: float, highest: int) -> ComplexArray:
-    """Return the lines (H,) of one period of a signal, by least squares beside a parabola; phases from ``start_s``."""
-    blank = np.zeros(len(time))
-    thin = thinned(Samples(time, signal, blank), _POINTS * highest)
-    time, signal = thin.time_s, thin.speed_rad_s
-    place = (time - 0.5 * (time[0] + time[-1])) / period_s
-    angle = np.multiply.outer((time - start_s) * (2.0 * math.pi / period_s), np.arange(1.0, highest + 1.0))
-    design = np.column_stack([np.ones(len(time)), place, place**2 - 1.0 / 12.0, np.cos(angle), np.sin(angle)])
-    # the angle grows by many turns in a period: its mean is removed first, so that the normal equations are accurate
-    solution = np.linalg.solve(design.T @ design, design.T @ (signal - signal.mean()))
-    found: ComplexArray = solution[3 : 3 + highest] - 1j * solution[3 + highest :]
-    return found
+def _lines(periods: Sequence[tuple[FloatArray, FloatArray]], segment: Segment, highest: int) -> ComplexArray:
+    """Return the lines (P, H) of time and signal of P periods, by least squares beside a parabola. Their phases are
+    from the start of the segment.
+    """
+    alike: list[tuple[FloatArray, list[FloatArray]]] = []      # periods of a uniform recording have the same equations
+    for time, signal in periods:
+        thin = thinned(Samples(time, signal, np.zeros(len(time))), _POINTS * highest)
+        turn = (thin.time_s - segment.start_s) / segment.period_s
+        turn -= math.floor(turn[len(turn) // 2])
+        if not alike or len(turn) != len(alike[-1][0]) or np.max(np.abs(turn - alike[-1][0])) > _SAME_PERIODS:
+            alike.append((turn, []))
+        # the angle grows by many turns in a period: without its mean the normal equations are accurate
+        alike[-1][1].append(thin.speed_rad_s - thin.speed_rad_s.mean())
+    found = []
+    for turn, signals in alike:
+        place = turn - 0.5 * (turn[0] + turn[-1])
+        angle = np.multiply.outer(2.0 * math.pi * turn, np.arange(1.0, highest + 1.0))
+        design = np.column_stack([np.ones(len(turn)), place, place**2 - 1.0 / 12.0, np.cos(angle), np.sin(angle)])
+        solution = np.linalg.solve(design.T @ design, design.T @ np.array(signals).T).T
+        found.append(solution[:, 3 : 3 + highest] - 1j * solution[:, 3 + highest :])
+    return np.concatenate(found)
 
 
 def _smoothed(harmonics: FloatArray, scatter: FloatArray, freedom: int) -> FloatArray:

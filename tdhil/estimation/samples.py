@@ -1,6 +1,7 @@
 """Selection of the samples of a recording for identification, and their whole periods."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,11 +88,11 @@ def _step(signal: FloatArray, quantum: float) -> float:
 
 def _long_runs(time: FloatArray, signal: FloatArray, longest_s: float) -> list[tuple[int, int]]:
     """Return the runs [begin, end) of equal values that last longer than ``longest_s`` and have enough samples."""
-    ends = np.flatnonzero(signal[1:] != signal[:-1])      # the last sample of every run except the last run
-    first, last = (int(ends[0]), int(ends[-1])) if len(ends) else (len(signal) - 1, -1)
-    between = [(int(ends[k]) + 1, int(ends[k + 1]) + 1) for k in np.flatnonzero(np.diff(ends) >= _LEAST_SAMPLES)]
-    return [(begin, end) for begin, end in ((0, first + 1), *between, (last + 1, len(signal)))
-            if end - begin >= _LEAST_SAMPLES and time[end - 1] - time[begin] > longest_s]
+    edges = np.concatenate(([0], np.flatnonzero(signal[1:] != signal[:-1]) + 1, [len(signal)]))
+    many = np.flatnonzero(np.diff(edges) >= _LEAST_SAMPLES)
+    begins, ends = edges[many], edges[many + 1]
+    lasting = time[ends - 1] - time[begins] > longest_s
+    return list(zip(begins[lasting].tolist(), ends[lasting].tolist(), strict=True))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -258,13 +259,24 @@ def usable_samples(recording: Recording) -> Samples:
     return Samples(time, speed, torque)
 
 
-def angle_readings(recording: Recording) -> tuple[FloatArray, FloatArray] | None:
-    """Return time (N,), s, and reported angle (N,), rad, of all readings; None if the drive reports no angle."""
-    if recording.position_rad is None:
+def angle_readings(
+    recording: Recording, spans: Sequence[tuple[float, float]] = ((-math.inf, math.inf),)
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return time (N,), s, and reported angle (N,), rad, of all readings; None if the drive reports no angle.
+
+    ``spans``: begin and end of the times that count, s, in their order and without overlap. If every sample of the
+    recording has an angle, these are its arrays, without a copy.
+    """
+    angle = recording.position_rad
+    if angle is None:
         return None
-    known = np.isfinite(recording.position_rad) & recording.fresh
-    return (np.asarray(recording.time_s[known], dtype=np.float64),
-            np.asarray(recording.position_rad[known], dtype=np.float64))
+    times: list[FloatArray] = []
+    turned: list[FloatArray] = []
+    for part in (slice(*np.searchsorted(recording.time_s, span)) for span in spans):
+        known = np.isfinite(angle[part]) & recording.fresh[part]
+        for found, signal in ((times, recording.time_s[part]), (turned, angle[part])):
+            found.append(np.asarray(signal if np.all(known) else signal[known], dtype=np.float64))
+    return (times[0], turned[0]) if len(times) == 1 else (np.concatenate(times), np.concatenate(turned))
 
 
 def acquisitions(recording: Recording) -> tuple[Stage, ...]:

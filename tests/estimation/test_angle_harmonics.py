@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tdhil.estimation import identify
+from tdhil.estimation import angle_harmonics, identify
 from tdhil.estimation.angle_harmonics import HarmonicTorque
 from tests.estimation.angle_bench import RATED_NM, OverAngle, run_over_angle
 from tests.estimation.shaft_bench import Rig
@@ -75,6 +75,15 @@ def test_nothing_changes_without_a_harmonic():
         assert found.harmonics == found.backlash == ()
         unknown = replace(found, harmonics=None, backlash=None, frequency_response=None)
         assert unknown == replace(before, frequency_response=None)
+
+
+@pytest.mark.heavy
+def test_a_long_recording_is_used_whole_if_its_first_periods_show_an_order(monkeypatch):
+    recording, without = recorded(6, 0.1)[0], recorded(0, 0.0)[0]
+    whole = identify(recording).harmonics
+    monkeypatch.setattr(angle_harmonics, "LOOK_POINTS", 1)      # the three periods that are the least
+    assert identify(recording).harmonics == whole
+    assert identify(without).harmonics == ()
 
 
 @pytest.mark.heavy

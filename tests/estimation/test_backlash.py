@@ -9,6 +9,7 @@ import pytest
 
 from profiles import MessageCode
 from tdhil.estimation import Verdict, backlash, identify
+from tdhil.recording import Segment
 from tests.estimation.angle_bench import COUNTS, OverAngle, run_over_angle
 from tests.estimation.stages_bench import Play
 
@@ -81,8 +82,8 @@ def test_a_decaying_oscillation_is_no_backlash():
     period_s, swing_hz, excited = 12.5, 0.176, tuple(range(1, 11))
     time = np.arange(0.0, 8 * period_s, 0.05)
     turned = 3.0 * time + 0.05 * np.exp(-0.02 * time) * np.cos(2.0 * math.pi * swing_hz * time)
-    lines = np.array([backlash._lines(time[k:k + 250], turned[k:k + 250], 0.0, period_s, 40)
-                      for k in range(0, len(time), 250)]).mean(axis=0)
+    periods = [(time[k : k + 250], turned[k : k + 250]) for k in range(0, len(time), 250)]
+    lines = backlash._lines(periods, Segment(0.0, 100.0, period_s, 0, 3.0, (), (), ()), 40).mean(axis=0)
     segment = backlash._SegmentAngle(
         period_s, 3.0, excited, lines, np.arange(11.0, 41.0), lines[10:], np.arange(11.0, 41.0) ** -2.0)
     left = segment.settled(segment.rest[None])[0]
@@ -91,3 +92,16 @@ def test_a_decaying_oscillation_is_no_backlash():
     play = replace(segment, theta=np.where(wave < 11, 0.05 * np.exp(1.7j * wave) / wave, 0.0))
     z = backlash._GapMotion.of(np.array([[5.0, 0.3, 0.0, 0.0]])).waves(play, 1000, np.zeros((10, 1)))[:, 10:]
     assert np.linalg.norm(segment.settled(z)) > 0.8 * np.linalg.norm(z)
+
+
+def test_the_lines_of_uniform_and_of_jittered_periods():
+    """Both are those of the signal; the first have one set of equations, the second one for each period."""
+    segment, wanted = Segment(2.0, 12.0, 2.0, 1, 3.0, (0.5,), (1.0,), (0.0,)), np.array([0.3, 0.2 - 0.1j, 0.05j])
+    rng = np.random.default_rng(3)
+    for jitter_s in (0.0, 3e-3):
+        periods = []
+        for begin in (4.0, 6.0, 8.0):
+            time = begin + 0.05 * np.arange(40) + jitter_s * rng.random(40)
+            turned = np.exp(1j * math.pi * np.multiply.outer(time - segment.start_s, [1.0, 2.0, 3.0])) @ wanted
+            periods.append((time, 3.0 * time + 0.01 * (time - begin) ** 2 + turned.real))
+        assert backlash._lines(periods, segment, 3) == pytest.approx(np.tile(wanted, (3, 1)), abs=1e-9)

@@ -100,13 +100,15 @@ def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) ->
     return [(where, float(part[0]), float(part[-1])) for part in parts if len(part)]
 
 
-def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[AngleRatio, ...]]:
+def angle_ratios(
+    recording: Recording, samples: Samples | None = None
+) -> tuple[tuple[AngleRatio, ...], tuple[AngleRatio, ...]]:
     """Return the ratios of the steady levels, and those of stage 5: its segments, or the whole stage without
-    segments.
+    segments. ``samples``: the usable ones, if they are known.
     """
     if recording.position_rad is None:
         return (), ()
-    samples = usable_samples(recording)
+    samples = usable_samples(recording) if samples is None else samples
     steady = [("stage 2", level.start_s, level.end_s) for level in recording.levels]
     segments = () if recording.excitation is None else recording.excitation.segments
     excited = [("stage 5", *excited_window(segment)) for segment in segments] or [
@@ -120,9 +122,9 @@ def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[An
     return found[0], found[1]
 
 
-def angle_contradiction(recording: Recording) -> Refusal | None:
+def _contradiction(recording: Recording, samples: Samples) -> Refusal | None:
     """Return the contradiction between the angle and the speed used for J; None without one, or without an angle."""
-    steady, excited = angle_ratios(recording)
+    steady, excited = angle_ratios(recording, samples)
     for one in excited:
         if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:
             return Refusal(
@@ -148,7 +150,7 @@ def angle_checked(finding: Finding, case: Case) -> Finding:
     """Return the finding, without its inertia if the angle contradicts the speed. Never raises."""
     if finding.inertia is None or case.recording.position_rad is None:
         return finding
-    contradiction = angle_contradiction(case.recording)
+    contradiction = _contradiction(case.recording, case.samples)
     if contradiction is None:
         return finding
     return finding.taken_back(contradiction)
