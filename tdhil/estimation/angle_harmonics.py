@@ -598,7 +598,7 @@ def _widened(
 
 @dataclass(frozen=True)
 class _SeenAngle:
-    """What is seen of the angle: as a function of time, on the grid of each segment, and at the excited lines."""
+    """Angle of the shaft as a function of time, on the grid of each segment, and at the excited lines."""
 
     angle: _Angle
     segments: dict[int, _GridSegment]
