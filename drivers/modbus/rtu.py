@@ -202,7 +202,10 @@ class RtuLink:
 
     def _come_into_step(self) -> None:
         """Discard late data, and wait for a reply that may still come."""
-        late = bool(self._port_waiting())
+        try:
+            late = bool(self._port.in_waiting)
+        except Exception as error:      # any type of error, as in `transact`
+            raise self._gone(str(error)) from error
         if not late and not self._listen_s:
             return
         until_s = self.clock.now_s() + self._listen_s
@@ -221,12 +224,6 @@ class RtuLink:
         return None if length is None else length + UNIT_AND_CRC
 
     # -- the device ------------------------------------------------------------------------------------------
-
-    def _port_waiting(self) -> int:
-        try:
-            return int(self._port.in_waiting)
-        except Exception as error:      # any type of error, as in `transact`
-            raise self._gone(str(error)) from error
 
     def _read(self) -> bytes:
         """Return the data received within one time slice."""

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil, log, log2
+from math import ceil, log
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.soft_torque.controller import SpeedController
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.simulation import (
     LONGEST_TICK_S,
@@ -76,12 +75,6 @@ def longest_integral_time_s(mode_hz: float) -> float:
     return CALM_PERIODS / mode_hz * 2.0**MOST_DOUBLED / CALM_INTEGRAL_TIMES
 
 
-def _doubled(controller: SpeedController, search: Search) -> int:
-    """Return how often `Search.calm_s` is doubled for this controller."""
-    ratio = CALM_INTEGRAL_TIMES * controller.integral_time_s / search.calm_s
-    return ceil(log2(min(max(ratio, 1.0), 2.0**MOST_DOUBLED)) - 1e-9)
-
-
 def lowest_turning(strings: Strings, loops: Sequence[Loop], how: Start, search: Search) -> list[float | None]:
     """Return for each loop the lowest set speed, rpm, at and above which the bit turns in the end; None: not found.
 
@@ -135,7 +128,8 @@ def ends_turning(
     target, ramp = speeds_rpm * RPM, search.start_ramp_rpm_s * RPM
     simulation = LoopSimulation(strings, loops, Begin(how, target), target, ramp, search.longest_tick_s,
                                 disturbance=seeds)
-    calm_s = search.calm_s * 2.0 ** np.array([_doubled(controller, search) for _, controller in loops])
+    longer = CALM_INTEGRAL_TIMES / search.calm_s * np.array([controller.integral_time_s for _, controller in loops])
+    calm_s = search.calm_s * 2.0 ** np.ceil(np.log2(np.clip(longer, 1.0, 2.0**MOST_DOUBLED)) - 1e-9)
     duration_s, rest = np.maximum(search.duration_s, 2.0 * calm_s), np.array(how) == "rest"
     for one in np.unique(calm_s):      # loops with one calm time end together, after the longest ramp from rest
         from_rest = rest & (calm_s == one)

@@ -373,21 +373,18 @@ class _BitNoise:
         """Return the noise torque during a tick, N·m. Call it for every tick in order."""
         row = tick % NOISE_BLOCK
         if row == 0:
-            self._draw_block()
+            drawn = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
+            block = self._new * drawn[:, self._seed_at]
+            for place in range(NOISE_BLOCK):
+                block[place] += self._keep * self._state
+                self._state = block[place]
+            self._torque_nm = self._rms * block
         found: Array = self._torque_nm[row].take(self._noise_at)
         return found
 
     def keep(self, cases: NDArray[np.bool_]) -> None:
         """Go on with these cases only."""
         self._noise_at = self._noise_at[cases]
-
-    def _draw_block(self) -> None:
-        drawn = np.array([random.standard_normal(NOISE_BLOCK) for random in self._random]).T
-        block = self._new * drawn[:, self._seed_at]
-        for tick in range(NOISE_BLOCK):
-            block[tick] += self._keep * self._state
-            self._state = block[tick]
-        self._torque_nm = self._rms * block
 
 
 def _columns(values: Sequence[Sequence[float]], repeats: int) -> Array:

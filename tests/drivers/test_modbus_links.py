@@ -71,7 +71,7 @@ class Line:
     def wait_until_it_lies_there(self):
         """What was written reaches a pty's other end, or a socket's, when the kernel comes to it."""
         link, end_s = self.link, time.monotonic() + HANGS_S
-        while not (link._port_waiting() if self.kind == "rtu" else select.select((link._socket,), (), (), 0)[0]):
+        while not (link._port.in_waiting if self.kind == "rtu" else select.select((link._socket,), (), (), 0)[0]):
             assert time.monotonic() < end_s
             time.sleep(0.001)
 
