@@ -31,6 +31,7 @@ from tests.service.test_serve import served
 DOCS = Path(__file__).parents[1] / "docs" / "images"
 RIG, SEED = "simulated-canopen", 7
 LIVE_PX, RESULT_PX = 760, 1180
+ALL_PICTURES = "Promise.all([...document.images].map((one) => { one.loading = 'eager'; return one.decode(); }))"
 MOVING = "() => document.getElementById('state').textContent.includes('acquire')"
 
 
@@ -67,6 +68,7 @@ def every_page(chromium: Any, server: Any, folder: Path) -> None:
         for title, path in PAGES.items():
             page.goto(path.format(run=run))
             page.wait_for_timeout(1500)                # pages ask again and again: the network is never idle
+            page.evaluate(ALL_PICTURES)
             save(page, folder / f"{title}-{name}.png", whole=True)
 
 

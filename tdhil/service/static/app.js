@@ -699,13 +699,15 @@
       const over = ENDED.includes(status.state);
       if (!over) wentOn = true;
       if (status.simulated) byId("simulated").hidden = false;       // a simulator on a bus is recognized in preflight
-      if (over && wentOn && !["stop_not_confirmed", "interrupted"].includes(status.state)) {      // the page becomes the result, once; a shaft that may still turn keeps its Stop
+      const rests = over && !["stop_not_confirmed", "interrupted"].includes(status.state);
+      if (rests && wentOn) {      // the page becomes the result, once; a shaft that may still turn keeps its Stop
         try { sessionStorage.removeItem(STARTED); } catch (error) { /* nothing was kept */ }
         location.replace(`/runs/${run}`);
         return;
       }
       byId("ended").hidden = !over;
       byId("stop").disabled = over;
+      byId("stop").closest(".stopbar").classList.toggle("past", rests);      // nothing is left to stop: only the times stay
       const confirm = status.state === "awaiting_confirmation" && status.confirmation;
       byId("confirm").hidden = !confirm;
       if (confirm) {

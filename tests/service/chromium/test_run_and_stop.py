@@ -38,7 +38,9 @@ def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
     ("identify", "failed"), ("ask", "refused"), ("brake", "stop_not_confirmed"),
 ])
 def test_a_page_becomes_the_result_once_the_shaft_stands_still(page, served, what, state):
-    """Also after a failure and a refusal. If standstill is not confirmed, the live page with its Stop stays."""
+    """Also after a failure and a refusal. If standstill is not confirmed, the live page with its Stop stays. Else the
+    live page has no Stop any more.
+    """
     run = begin(served, what) if what != "identify" else served.service.supervisor.start_run(
         "a", {"note": what}, "local").request.id
     folder = served.service.store.place(run)
@@ -52,8 +54,12 @@ def test_a_page_becomes_the_result_once_the_shaft_stands_still(page, served, wha
         page.locator("#state", has_text="STOP NOT CONFIRMED").wait_for()
         page.wait_for_timeout(500)
         assert page.url.endswith("/live") and page.get_by_role("link", name="To the result").is_visible()
+        assert page.get_by_role("button", name="Stop", exact=True).is_visible()
     else:
         page.wait_for_url(f"**/runs/{run}")
+        page.goto(f"/runs/{run}/live")                 # looked at again: nothing is left to stop
+        page.get_by_role("link", name="To the result").wait_for()
+        assert page.get_by_role("button", name="Stop", exact=True).is_hidden()
     os.kill(stored["pid"], signal.SIGKILL)             # it did not end: only its file says so
 
 
