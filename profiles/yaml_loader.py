@@ -428,6 +428,8 @@ M = TypeVar("M", bound=BaseModel)
 
 MAX_BYTES = 256 * 1024
 MAX_PROBLEMS = 50
+_FOREIGN_KEYS = 5      # unknown keys, from which a file may be one of another kind
+_FOREIGN_TIMES = 4     # unknown keys for each known one, from which it is one
 
 
 @dataclass(frozen=True)
@@ -473,6 +475,11 @@ def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = Fa
                 tree.problems += [one.refused(name) for one in conversions]
             value = _validated(tree, model)
     except ValidationError as error:
+        unknown = sum(item["type"] == "extra_forbidden" and len(item["loc"]) == 1 for item in error.errors())
+        if unknown >= max(_FOREIGN_KEYS, _FOREIGN_TIMES * (len(tree.data) - unknown)):
+            known = sorted(info.alias or key for key, info in model.model_fields.items())
+            raise _one(name, 0, f"a file of another kind: {unknown} of its {len(tree.data)} keys are unknown; known "
+                       f"here: {', '.join(known)}") from None
         raise _all(tree.problems + problems_of(error, tree, model)) from None
     if tree.problems:
         raise _all(tree.problems)

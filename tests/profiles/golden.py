@@ -52,7 +52,7 @@ from profiles.yaml_loader import load_model
 FOLDER = Path(__file__).parent / "golden"
 
 Pdu = Annotated[str, Field(pattern=r"^[0-9A-F ]+$")]
-ModeName = Literal["speed", "torque"]
+ModeName = Literal["torque", "speed"]      # the order of the options: typing takes unions of both orders for one
 Wish = Literal["off", "enabled", "quick_stop"]
 
 

@@ -37,6 +37,17 @@ def refused(text: str) -> list[tuple[int, str]]:
     return [(problem.line, problem.message) for problem in caught.value.problems]
 
 
+def test_a_file_of_another_kind_is_one_problem() -> None:
+    """Such as a result document, which has a drive and a profile too."""
+    foreign = "".join(f"key{number}: 1\n" for number in range(8))
+    known = "a, b, n, options, part, parts, s"
+    text = "a file of another kind: 8 of its {} keys are unknown; known here: " + known
+    assert refused(foreign) == [(0, text.format(8))]
+    assert refused(f"{foreign}a: 1\nb: 1\n") == [(0, text.format(10))]
+    assert len(refused(f"{foreign}a: 1\nb: true\nn: 1\n")) == 8
+    assert len(refused("key1: 1\nkey2: 1\n")) == 2
+
+
 def test_where_a_number_is_wanted_no_truth_value_is_advised() -> None:
     assert refused("a: yes") == [(1, "a: must be a number, not the text 'yes'")]
 
@@ -148,9 +159,9 @@ def test_all_problems_at_once_in_the_order_of_the_file() -> None:
 
 
 def test_many_problems_are_cut_short() -> None:
-    found = refused("".join(f"x{i}: 1\n" for i in range(500)))
+    found = refused("part:\n" + "".join(f"  x{i}: 1\n" for i in range(500)))
     assert len(found) == MAX_PROBLEMS + 1
-    assert "450 more" in found[-1][1]
+    assert "451 more" in found[-1][1]
 
 
 def test_billion_laughs_stops_at_its_first_alias() -> None:
