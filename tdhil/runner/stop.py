@@ -246,6 +246,7 @@ class StopReport:
     trouble: tuple[str, ...] = ()
     trapped_nm: float = 0.0            # torque of a drill string at standstill, before its release; signed
     stayed_in_torque_mode: bool = False    # speed mode was needed for the stop, and not confirmed
+    beside: tuple[str, ...] = ()       # errors of log, observer and display meanwhile, each once
 
 
 class StopSequence:
@@ -339,7 +340,7 @@ class StopSequence:
 
     def _ended(self, confirmed: bool, at_rest_s: float | None, disabled: bool) -> StopReport:
         return StopReport(confirmed, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
-                          self._stayed_in_torque_mode)
+                          self._stayed_in_torque_mode, tuple(dict.fromkeys(self._loop.stop_side_troubles)))
 
     # -- with a drill string -----------------------------------------------------------------------------------
 

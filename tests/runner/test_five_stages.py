@@ -161,3 +161,19 @@ def test_settings_that_could_not_be_given_back_are_in_the_log(world):
     here.drive.left = ("6072h: no answer",)
     assert here.runner().run().cause is None
     assert any("6072h" in event[-1] and "not restored" in event[-1] for event in here.log.events)
+
+
+def test_an_error_of_the_display_during_the_stop_is_told_once(world):
+    here = world()
+    said: list[str] = []
+
+    def broken(stage, cycles):
+        if stage == "torque":
+            raise OSError("the terminal is gone")
+
+    here.display.on_cycle = broken
+    result = here.runner(say=said.append).run()
+    assert result.stop.confirmed
+    text = "OSError: the terminal is gone"
+    assert [event[-1] for event in here.log.events].count(f"error beside the stop: {text}") == 1
+    assert said.count(f"error beside the stop, which went on: {text}") == 1
