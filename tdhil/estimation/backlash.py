@@ -21,7 +21,9 @@ flank, and a from the instants at which it leaves a flank.
 
 A linear shaft has no angle at harmonics of the period that are not excited, apart from what its torque does there. So
 the reported angle less T/(J s²) of the reported torque, averaged over the periods, is η z at these harmonics, and
-noise. J is roughly |T|/|s² θ| at the lowest excited line. Its error makes no angle there on average.
+noise. T has the filter of the reported torque taken out. The play may have bent the filter that was fitted, so the
+torque as reported is tried too, and what leaves less of the angle counts. J is roughly |T|/|s² θ| at the lowest excited
+line. Its error makes no angle there on average.
 Nonlinear friction and reports that repeat leave an angle too, with another pattern. It is taken as random, with a
 variance that falls with a power of the frequency. The backlash must explain more than any such variance does.
 
@@ -67,19 +69,20 @@ _TRANSIENT_TERMS = 3      # powers of 1/(j ω) of a decaying motion; the next on
 _READINGS = 5             # readings of the angle for one harmonic, at least
 _POINTS = 8               # points for one harmonic that are kept of a recording with more
 _SAME_PERIODS = 1e-9      # periods; instants closer than this are the same: 1e-7 of a turn of the highest harmonic
+_NO_ANGLE_RAD = 1e-15     # rad; far below any reading, so that an angle of 0 has a logarithm
 _NEIGHBOURS = 7           # harmonics on either side, over which the scatter is smoothed
 _STEPS = 1000             # steps of a period in which the motion between the flanks is computed
 _COARSE_STEPS = 400       # the same on the coarse grid
 _SLOPES = (1, 2, 3, 4)    # powers of 1/frequency of the angle that other distortion leaves
 _LEVELS = np.concatenate(([0.0], np.geomspace(1e-2, 1e5, 15)))
 """Variances of this distortion at the lowest harmonic, over that of the noise."""
-_CROSSINGS = np.geomspace(0.01, 0.25, 6)
+_CROSSINGS = np.geomspace(0.01, 0.476, 7)
 """Times from flank to flank on the grid, in periods of the highest excited line."""
 _LEAVINGS = np.linspace(0.03, 0.97, 17)
 """Values of a on the grid, in units of the largest deceleration: outside of 0 to 1 no torque reverses."""
 _VISCOUS = (0.0, 0.5, 1.0)
 """Shares of b ω in a on the grid, at the mean speed."""
-_REBOUNDS = (0.0, 0.4)    # e on the grid
+_REBOUNDS = (0.0, 0.4, 0.7)    # e on the grid
 _MOST_REBOUND = 0.75      # largest e; a damping ratio of 9 % of the closed coupling
 _PASSES = 2               # passes of the grid, after the first look
 _ROUNDS = 12              # steps of a fit
@@ -350,12 +353,14 @@ def _angle_of(
     s: ComplexArray = np.asarray(2j * np.pi * harmonics / segment.period_s, dtype=np.complex128)
     lowest = min(excited) - 1
     rough = abs(complex(torque[:, lowest].mean() / (s[lowest] ** 2 * table[:, lowest].mean())))
-    through = np.ones_like(s)      # the filter of the reported torque, if a model was fitted
+    free = ~np.isin(harmonics, excited)
+    through = [np.ones_like(s)]      # the filter of the reported torque: none, or that of a fitted model
     if isinstance(finding.curve, ModelCurve):
         fitted = finding.curve.fitted
-        through = filters(fitted.likelier.theta[fitted.problem.model.mechanical :], s)[1]
-    rest = table - torque / (through * s**2 * rough)
-    free = ~np.isin(harmonics, excited)
+        through.append(filters(fitted.likelier.theta[fitted.problem.model.mechanical :], s)[1])
+    # A play bends the fitted filter: the one that leaves less of the angle counts.
+    rest = min((table - torque / (one * s**2 * rough) for one in through),
+               key=lambda rest: float(np.mean(np.log(np.abs(rest.mean(axis=0)[free]) + _NO_ANGLE_RAD))))
     mean = rest.mean(axis=0)
     scatter = np.sum(np.abs(rest - mean) ** 2, axis=0)[free] / (len(rest) - 1)
     seen = _SegmentAngle(
