@@ -217,17 +217,18 @@ def _first_periods(stretch: Stretch) -> Stretch:
 
 
 def _span(stretch: Stretch) -> tuple[float, float]:
-    """Return begin and end of the longest run of periods of a stretch, s."""
-    first, last = (stretch.index[k] for k in _run(stretch.index))
-    begin = stretch.segment.start_s + first * stretch.segment.period_s
-    return begin, begin + (last - first + 1) * stretch.segment.period_s
+    """Return the begin of the first period of a stretch, and the end of its last one, s."""
+    start_s, period_s = stretch.segment.start_s, stretch.segment.period_s
+    return start_s + stretch.index[0] * period_s, start_s + (stretch.index[-1] + 1) * period_s
 
 
 def _segment(stretch: Stretch, samples: Samples, angle: _Angle) -> _GridSegment | None:
     if not stretch.index:
         return None
-    period_s, (begin, end) = stretch.segment.period_s, _span(stretch)
-    periods = round((end - begin) / period_s)
+    first, last = (stretch.index[k] for k in _run(stretch.index))
+    periods, period_s = last - first + 1, stretch.segment.period_s
+    begin = stretch.segment.start_s + first * period_s
+    end = begin + periods * period_s
     inside = samples.between(begin - 1e-9, end - 1e-9)
     if periods < LEAST_PERIODS or not angle.covers(begin, end, LONGEST_GAP / max(stretch.segment.lines_hz)):
         return None
