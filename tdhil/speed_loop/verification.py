@@ -45,8 +45,8 @@ moves it by two standard deviations (a third of the half-width each). The second
 longer record must be longer."""
 LEAST_PAIRS = 8
 """Smallest number of pairs of steps. With fewer, their scatter is too uncertain."""
-_DRAWS = 400
-"""Number of random draws of the fitted loop, for the intervals of its figures."""
+_DRAWS, _LEAST_KEPT = 400, 40
+"""Number of random draws of the fitted loop, for the intervals of its figures, and the likeliest that always count."""
 _EXCLUDED = 31.3
 """Rise of the fit's cost from which the response excludes a draw: 99.9 % quantile of χ² with 11 degrees of freedom."""
 _SHUFFLES = 300
@@ -275,8 +275,9 @@ def _possible(theta: Reals, covariance: Reals, cost: Callable[[Reals], float], b
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(variances, 0.0))
     draws = theta + np.random.default_rng(1).standard_normal((_DRAWS, len(theta))) @ root.T
-    most = cost(theta) + _EXCLUDED * birge
-    return [theta, *(one for one in draws if cost(one) <= most)]
+    costs = np.array([cost(one) for one in draws])
+    kept = max(_LEAST_KEPT, int(np.sum(costs <= cost(theta) + _EXCLUDED * birge)))
+    return [theta, *draws[np.argsort(costs)[:kept]]]
 
 
 def _slopes(model: StepModel, theta: Reals, now: Reals) -> Reals:

@@ -239,3 +239,12 @@ def test_pairs_are_free_of_offset_and_drift_and_the_first_is_dropped():
     pairs = step_pairs(time_s, speed, starts, program, PERIOD_S)
     assert len(pairs) == program.pairs
     np.testing.assert_allclose(pairs, 1.0 - 0.5 * 1e-4 * program.half_s / program.step_rad_s, atol=1e-9)
+
+
+def test_where_the_response_excludes_all_draws_the_likeliest_ones_count():
+    """One draw alone would give figures without a width."""
+    kept = verification._possible(np.zeros(2), np.eye(2), lambda one: 1e6 * float(one @ one), 1.0)
+    away = np.linalg.norm(kept, axis=1)
+    assert len(kept) == 1 + verification._LEAST_KEPT
+    assert away[0] == 0.0 and np.all(np.diff(away) >= 0.0)
+    assert away[-1] < 1.0      # four of ten of a normal distribution of two parameters
