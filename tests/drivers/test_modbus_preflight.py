@@ -1,6 +1,7 @@
 """Before motion: the marker, the whole table on a right drive, and every wrong of a register map, on a bank of ours."""
 
 import dataclasses
+import itertools
 import json
 
 import pytest
@@ -159,6 +160,16 @@ def test_a_turning_shaft_and_local_control(bank, generic):
     assert set(rows) == {"state", "control over the field bus"}
     assert "2.09 rad/s" in rows["state"].found
     assert bank.writes == []
+
+
+@pytest.mark.parametrize("first", range(3))
+def test_one_reading_of_noise_is_no_turning_shaft(bank, generic, first):
+    """0.105 rad/s in each third reading: one of the three begins with it."""
+    readings = itertools.cycle([100, 5, -5][first:] + [100, 5, -5][:first])
+    bank.feedback = lambda: (next(readings), 0)
+    assert "state" not in refused(bank, generic)
+    bank.feedback = lambda: (100, 0)
+    assert "0.105 rad/s" in refused(bank, generic)["state"].found
 
 
 def test_a_fault_reaction_is_refused(bank, generic):
