@@ -476,7 +476,7 @@ def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = Fa
             value = _validated(tree, model)
     except ValidationError as error:
         unknown = sum(item["type"] == "extra_forbidden" and len(item["loc"]) == 1 for item in error.errors())
-        if unknown >= max(_FOREIGN_KEYS, _FOREIGN_TIMES * (len(tree.data) - unknown)):
+        if unknown >= _FOREIGN_KEYS and unknown >= _FOREIGN_TIMES * (len(tree.data) - unknown):
             known = sorted(info.alias or key for key, info in model.model_fields.items())
             raise _one(name, 0, f"a file of another kind: {unknown} of its {len(tree.data)} keys are unknown; known "
                        f"here: {', '.join(known)}") from None

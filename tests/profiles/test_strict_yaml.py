@@ -46,6 +46,8 @@ def test_a_file_of_another_kind_is_one_problem() -> None:
     assert refused(f"{foreign}a: 1\nb: 1\n") == [(0, text.format(10))]
     assert len(refused(f"{foreign}a: 1\nb: true\nn: 1\n")) == 8
     assert len(refused("key1: 1\nkey2: 1\n")) == 2
+    for other in ("5", "true", "[1, 2]", "text"):
+        assert "must be a section" in refused(other)[0][1]
 
 
 def test_where_a_number_is_wanted_no_truth_value_is_advised() -> None:
