@@ -15,7 +15,7 @@ from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import RANGES, Scales, find_scales, from_words, register_name, si_per_count, to_counts
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.parameters import Parameters, check_name_plate, check_required, find_rated_torque, read_parameters
-from drivers.modbus.state_machine import decode, power_state, seen
+from drivers.modbus.state_machine import STILL_COUNTS, STILL_SHARE, decode, power_state, seen
 from drivers.modbus.watchdog import counts_of, is_off
 from drivers.preflight import PreflightTable, check_nothing_held
 from drivers.standstill import STANDSTILL_RAD_S
@@ -126,12 +126,9 @@ def _check_one(
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-STILL_COUNTS, STILL_SHARE = 5, 0.005
-"""Noise of a standstill before motion: this number of counts, or this share of the speed limit if that is more; at
-most `STANDSTILL_RAD_S`."""
 STILL_READINGS = 5
-"""Number of readings whose median magnitude counts if one reading exceeds this noise. Of 200 simulated drives at
-standstill, three had one such reading."""
+"""Number of readings whose median magnitude counts if one reading exceeds the noise of a standstill. Of 200 simulated
+drives at standstill, three had one such reading."""
 COARSEST_SHARE = 0.05
 """Largest value of one count, as a share of the limit."""
 MODE_POLLS, MODE_POLL_S = 20, 0.05

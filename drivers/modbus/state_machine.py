@@ -16,8 +16,8 @@ STILL_S = 0.2
 LEAST_SAMPLES = 5
 MOST_GAPS = 2
 """Number of successive lost replies that do not reset the detection. A shaft can't start and stop within this time."""
-COUNTS, SHARE = 5, 0.005
-"""Limit of each sample: this number of counts, or this share of the speed limit if that is more."""
+STILL_COUNTS, STILL_SHARE = 5, 0.005
+"""Noise of a standstill in each sample: this number of counts, or this share of the speed limit if that is more."""
 MEAN_COUNTS, MEAN_SHARE = 1, 0.001
 """Limit of the mean: number of counts, or share of the speed limit. The mean of noise is small; that of a creeping
 shaft is not."""
@@ -27,7 +27,7 @@ class ZeroSpeed:
     """Detects standstill: the speed stays at zero for `STILL_S` and `LEAST_SAMPLES` samples without a longer gap."""
 
     def __init__(self, count_rad_s: float, limit_rad_s: float, period_s: float) -> None:
-        self._peak_rad_s = max(COUNTS * count_rad_s, SHARE * limit_rad_s)
+        self._peak_rad_s = max(STILL_COUNTS * count_rad_s, STILL_SHARE * limit_rad_s)
         self._mean_rad_s = max(MEAN_COUNTS * count_rad_s, MEAN_SHARE * limit_rad_s)
         self._gaps = 0
         self._last: deque[float] = deque(maxlen=max(LEAST_SAMPLES, math.ceil(STILL_S / period_s)))

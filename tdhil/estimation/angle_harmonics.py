@@ -37,7 +37,7 @@ from tdhil.estimation.cubic_spline import CubicSpline
 from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segment_means, widened
 from tdhil.estimation.result import AngleHarmonic, Estimate, normal_quantile
-from tdhil.estimation.samples import LONGEST_GAP, Samples, Stretch, angle_readings, usual_interval
+from tdhil.estimation.samples import ALL_TIME, LONGEST_GAP, Samples, Stretch, angle_readings, usual_interval
 from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Recording
 
@@ -609,7 +609,7 @@ class _SeenAngle:
     def of(cls, case: PeriodicCase, stretches: tuple[Stretch, ...]) -> _SeenAngle | None:
         """Return the angle over the stretches of the case, or over a part of them; None if it is not known there."""
         whole = stretches is case.stretches
-        spans = ((-math.inf, math.inf),) if whole else tuple(_span(one) for one in stretches if one.index)
+        spans = ALL_TIME if whole else tuple(_span(one) for one in stretches if one.index)
         angle = _Angle.of(case.recording, spans)
         if angle is None:
             return None

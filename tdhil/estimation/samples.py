@@ -259,8 +259,11 @@ def usable_samples(recording: Recording) -> Samples:
     return Samples(time, speed, torque)
 
 
+ALL_TIME = ((-math.inf, math.inf),)      # s; span of a whole recording
+
+
 def angle_readings(
-    recording: Recording, spans: Sequence[tuple[float, float]] = ((-math.inf, math.inf),)
+    recording: Recording, spans: Sequence[tuple[float, float]] = ALL_TIME
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return time (N,), s, and reported angle (N,), rad, of all readings; None if the drive reports no angle.
 
