@@ -8,6 +8,7 @@ import json
 import os
 import threading
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -232,8 +233,10 @@ def test_two_runs_of_a_rig_give_its_torque_calibration(call, service, monkeypatc
     call("POST", "/rigs/a/calibration", 404, json={**body, "without": "../../x"})
     both = call("POST", "/rigs/a/calibration", 422, json={**body, "added_kg_m2": 0.0, "added_sd_kg_m2": -1.0})
     assert [one["option"] for one in both["fields"]] == ["added_kg_m2", "added_sd_kg_m2"]
+    stored = service.store.request
     with monkeypatch.context() as patched:
-        patched.setattr(service.store, "rehearsed", lambda run: run == loaded)
+        patched.setattr(service.store, "request",
+                        lambda run: replace(stored(run), options={"fault": ["trip@speed"]} if run == loaded else {}))
         (field,) = call("POST", "/rigs/a/calibration", 422, json=body)["fields"]
     assert field["option"] == "with_body" and "is a rehearsal of faults" in field["message"]
     (service.store.place(loaded) / "run.mcap").unlink()
