@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from tdhil.service.store import LOG
+
 MOST: Final = 64
 """Largest number of cached documents; a comparison of eight runs has about 100 kB."""
 
@@ -28,7 +30,7 @@ class DocumentCache:
             asked[name] for name in ("without", "with_body") if name in asked]
         try:
             files = [hashlib.sha256(Path(asked["rig_file"]).read_bytes()).hexdigest()] if what == "plan" else []
-            logs = [(one.st_size, one.st_mtime_ns) for one in ((self._runs / run / "run.mcap").stat() for run in runs)]
+            logs = [(one.st_size, one.st_mtime_ns) for one in ((self._runs / run / LOG).stat() for run in runs)]
         except OSError:
             return None
         return json.dumps([what, asked, logs, files], sort_keys=True)

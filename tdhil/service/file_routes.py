@@ -17,6 +17,7 @@ from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import apis
 from tdhil.service.run_state import NotThere
 from tdhil.service.schemas import PictureView
+from tdhil.service.store import LOG
 from tdhil.service.uploads import TRACE
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def routes(site: Site) -> list[Route]:
 
 async def log(site: Site, request: Request, body: None) -> Response:
     """Return the log, also during the run."""
-    return await file_of(site, request, "run.mcap", "application/octet-stream")
+    return await file_of(site, request, LOG, "application/octet-stream")
 
 
 async def report(site: Site, request: Request, body: None) -> Response:
@@ -75,7 +76,7 @@ async def samples(site: Site, request: Request, body: None) -> Response:
     """Return the samples as CSV. The file is made at the first request."""
     run = request.path_params["run"]
     folder = await off(lambda: site.store.place(run))
-    if not (folder / "samples.csv").exists() and (folder / "run.mcap").exists():
+    if not (folder / "samples.csv").exists() and (folder / LOG).exists():
         if not site.store.status(run).ended:
             raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended",
                              entry=MessageCode.NOT_READY)
@@ -130,7 +131,7 @@ async def file_of(site: Site, request: Request, name: str, media: str, *, shown:
     if request.method == "GET":
         site.supervisor.note(who, f"downloaded {name}", run, rig)
     called = f"{rig}-{run}-{name}" if rig else f"{run}-{name}"
-    grows = name == "run.mcap" and not (await off(lambda: site.store.status(run))).ended
+    grows = name == LOG and not (await off(lambda: site.store.status(run))).ended
     if grows and ("range" not in request.headers or "if-range" in request.headers):
         said = {"content-disposition": f'attachment; filename="{called}"'}
         return StreamingResponse(_as_it_is(path), media_type=media, headers=said)

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from tdhil.errors import MessageCode, UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Conflict, NotThere, Told, now, request_wrong
-from tdhil.service.store import Store, read_json, write_json
+from tdhil.service.store import LOG, Store, read_json, write_json
 
 if TYPE_CHECKING:
     from tdhil.fleet import FleetRow
@@ -184,7 +184,7 @@ class Fleets:
             root = self._runs
             if below:
                 raise request_wrong("the service's runs can only be used all together", "below", "Remove it")
-            if next(root.glob("*/run.mcap"), None) is None:
+            if next(root.glob(f"*/{LOG}"), None) is None:
                 raise UsageError("no run has a log yet", where=root.name, next_step="Start a run",
                                  entry=MessageCode.NOT_READY)
             return
@@ -307,7 +307,7 @@ def _own_logs(store: Store, *, archived: bool) -> tuple[str, ...]:
     """
     runs = sorted(one for one in store.ids() if archived or not store.annotations(one).archived)
     runs = [one for one in runs if not (read_json(store.place(one) / "request.json") or {}).get("uploaded")]
-    return tuple(str(path) for one in runs if (path := store.runs / one / "run.mcap").is_file())
+    return tuple(str(path) for one in runs if (path := store.runs / one / LOG).is_file())
 
 
 def main(folder: Path) -> int:

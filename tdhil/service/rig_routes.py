@@ -27,6 +27,7 @@ from tdhil.service.schemas import (
     TrendView,
 )
 from tdhil.service.start_request import EDITABLE, RigFile, ValuesWrong, options_of, require_motion, require_unwatched
+from tdhil.service.store import LOG
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -212,7 +213,7 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
             if known.uploaded is not None:
                 raise request_wrong("is an uploaded recording: it is not certain that it is of this drive",
                                     f"run {run}", "Calibrate with tdhil calibrate torque")
-            if not site.store.status(run).ended or not (site.store.place(run) / "run.mcap").is_file():
+            if not site.store.status(run).ended or not (site.store.place(run) / LOG).is_file():
                 raise UsageError("the run has no finished log", where=f"run {run}",
                                  next_step="Wait until it has ended", entry=MessageCode.NOT_READY)
 

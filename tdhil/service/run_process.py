@@ -26,7 +26,7 @@ from tdhil.service.letterhead import stored_letterhead
 from tdhil.service.run_channel import STOP_FILE, ChannelListener
 from tdhil.service.run_state import State, Status, Told, Watch, end_of, now, way_to
 from tdhil.service.start_request import binding_of, plan_of, read_rig, refuse_changed, run_request
-from tdhil.service.store import CONNECTION_FILE, Store, StoredRequest, read_json, write_json
+from tdhil.service.store import CONNECTION_FILE, LOG, Store, StoredRequest, read_json, write_json
 
 if TYPE_CHECKING:
     from tdhil.runner import RunOutcome
@@ -220,11 +220,11 @@ class RunProcess:
         from tdhil.session import conclude, is_evaluation, read
 
         try:
-            record = read(self.folder / "run.mcap")
+            record = read(self.folder / LOG)
             record.require_motion()
             if record.recording.excitation is None or is_evaluation(record.configuration):
                 return
-            found = conclude(record.recording, record.configuration, "run.mcap", record.assumed)
+            found = conclude(record.recording, record.configuration, LOG, record.assumed)
         except TdhilError:
             return                             # no data to identify from; the error of the run states why
         except Exception as error:

@@ -38,7 +38,7 @@ from tdhil.service.schemas import (
     plain,
 )
 from tdhil.service.start_request import ValuesWrong, options_of
-from tdhil.service.store import write_json
+from tdhil.service.store import LOG, write_json
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ async def compare(site: Site, request: Request, body: None) -> CompareView:
         raise request_wrong("name two to eight different runs", "runs", "?runs=ID,ID")
     archived, rehearsals = asks_for(request, "archived"), asks_for(request, "rehearsals")
     for one in which:
-        if not (await off(partial(site.store.place, one)) / "run.mcap").is_file():
+        if not (await off(partial(site.store.place, one)) / LOG).is_file():
             raise NotThere("this run has no log", where=f"run {one}")
         if not archived and (await off(partial(site.store.annotations, one))).archived:
             raise request_wrong("this run is archived", f"run {one}", "Add archived=true, or leave it out")
@@ -256,7 +256,7 @@ def _answers(made: ReplayView, asked: Mapping[str, Any]) -> bool:
 
 def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> ReplayView:
     folder = site.store.place(which)
-    if not site.store.status(which).ended or not (folder / "run.mcap").is_file():
+    if not site.store.status(which).ended or not (folder / LOG).is_file():
         raise UsageError("the run has no finished log", where=f"run {which}", next_step="Wait until it has ended",
                          entry=MessageCode.NOT_READY)
     with site.replay_names:

@@ -38,6 +38,7 @@ from tdhil.config import (
 )
 from tdhil.errors import MessageCode, TdhilError, UsageError
 from tdhil.service.run_state import NotAllowed, NotThere, request_wrong
+from tdhil.service.store import LOG
 from tdhil.session import address_of, connection_of
 
 if TYPE_CHECKING:
@@ -415,7 +416,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
     details = RunDetails.of(asked)
     options, connection = rig.way(asked)
     check_unverified(connection.profile, options)
-    options = options.replaced(log=replace(options.settings["log"], value="run.mcap"))
+    options = options.replaced(log=replace(options.settings["log"], value=LOG))
     peer = with_faults(plan_peer(options, connection), details.faults, connection.drive)
     if not peer.embedded:
         for one in OPTIONS:

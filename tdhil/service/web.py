@@ -51,6 +51,7 @@ from tdhil.service.run_channel import tell_viewed
 from tdhil.service.run_state import NotLoggedIn, NotThere, disk_full, request_wrong
 from tdhil.service.schemas import SOCKETS
 from tdhil.service.site import Site
+from tdhil.service.store import LOG
 from tdhil.service.supervisor import Supervisor
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -185,7 +186,7 @@ class Web(Site):
             return
         await socket.accept()
         feed = self.feeds.of(run, lambda: Feed(
-            folder / "run.mcap", lambda: self.store.status(run), lambda: tell_viewed(folder)))
+            folder / LOG, lambda: self.store.status(run), lambda: tell_viewed(folder)))
         queue = feed.watch()
         try:
             async with anyio.create_task_group() as both:
@@ -246,4 +247,4 @@ class Web(Site):
             return None
         asked, status = self.store.request(run), self.store.status(run)
         simulated = asked.simulated if status.simulated is None else status.simulated
-        return Running(run, self.store.place(run) / "run.mcap", simulated, asked.rehearsal)
+        return Running(run, self.store.place(run) / LOG, simulated, asked.rehearsal)

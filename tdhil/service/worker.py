@@ -19,6 +19,7 @@ from typing import Any, Final
 from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told, disk_full
+from tdhil.service.store import LOG, Store, read_as
 
 NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "scan": 0, "check": 0, "pace": 0}
 """Nice values of the tasks for which a page waits. A run by the clock has 0."""
@@ -69,7 +70,6 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
     """Write the report of a run with a result to the named file."""
     from tdhil.report import require_extra, write_report
     from tdhil.service.letterhead import stored_letterhead
-    from tdhil.service.store import Store
     from tdhil.session import read
 
     require_extra("report")
@@ -80,7 +80,7 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
     document = noted.shown_on(_signed(json.loads(Path("result.json").read_bytes())))
     letterhead = stored_letterhead(Path("../.."))
     with _put(wanted) as beside:
-        write_report(document, read("run.mcap").recording, beside, letterhead)
+        write_report(document, read(LOG).recording, beside, letterhead)
         os.utime(beside, ns=(began_ns, began_ns))      # a change while the report was made makes it outdated
     return {"document": {"file": wanted}}
 
@@ -89,12 +89,11 @@ def _signed(document: dict[str, Any]) -> dict[str, Any]:
     """Return the result in the present folder with the signature under its acceptance, if a person signed it."""
     from tdhil.file_hash import sha256_of
     from tdhil.service.acceptance_signature import FILE, AcceptanceSignature
-    from tdhil.service.store import read_as
 
     acceptance, signature = document.get("acceptance"), read_as(AcceptanceSignature, Path(FILE))
     if not acceptance or signature is None:
         return document
-    problem = signature.problem(acceptance, sha256_of(Path("run.mcap"), missing=""))
+    problem = signature.problem(acceptance, sha256_of(Path(LOG), missing=""))
     return {**document, "acceptance": {**acceptance, "signature": {**asdict(signature), "problem": problem}}}
 
 
@@ -102,10 +101,10 @@ def samples(asked: dict[str, Any]) -> dict[str, Any]:
     """Write the run's samples as samples.csv, as `tdhil export` does."""
     os.chdir(asked["folder"])
     with _put("samples.csv") as beside:
-        command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
+        command = [sys.executable, "-m", "tdhil", "export", LOG, "--to", "csv", "-o", str(beside)]
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
         if not beside.exists():
-            raise UsageError(" ".join(done.stderr.split())[:500] or "can't be exported", where="run.mcap")
+            raise UsageError(" ".join(done.stderr.split())[:500] or "can't be exported", where=LOG)
     return {"document": {"file": "samples.csv"}}
 
 
@@ -117,7 +116,7 @@ def recover(asked: dict[str, Any]) -> dict[str, Any]:
     os.chdir(asked["folder"])
     with suppress(LogError, OSError, UsageError):
         if not Path("recovered.mcap").exists():
-            write_copy(Path("run.mcap"), Path("recovered.mcap"), examine(Path("run.mcap")))
+            write_copy(Path(LOG), Path("recovered.mcap"), examine(Path(LOG)))
     with suppress(LogError, UsageError, ValueError):
         return replay({"folder": asked["folder"]})
     return {"document": None}
@@ -135,7 +134,7 @@ def compare(asked: dict[str, Any]) -> dict[str, Any]:
     from tdhil.fleet import FleetSettings, compare_document, identified
 
     os.chdir(asked["runs_folder"])
-    return {"document": compare_document([identified(Path(run) / "run.mcap",
+    return {"document": compare_document([identified(Path(run) / LOG,
                                                      FleetSettings()) for run in asked["runs"]])}
 
 
@@ -145,7 +144,7 @@ def calibrate(asked: dict[str, Any]) -> dict[str, Any]:
 
     os.chdir(asked["runs_folder"])
     bodies = ((asked["without"], 0.0, 0.0), (asked["with_body"], asked["added_kg_m2"], asked["added_sd_kg_m2"]))
-    runs = [CalibrationRun(read(Path(run) / "run.mcap"), added, sd) for run, added, sd in bodies]
+    runs = [CalibrationRun(read(Path(run) / LOG), added, sd) for run, added, sd in bodies]
     return {"document": document_of_calibration(find_calibration(runs, asked["at"]))}
 
 
@@ -191,7 +190,7 @@ def evidence(asked: dict[str, Any]) -> dict[str, Any]:
     os.chdir(asked["folder"])
     given = EvidenceOptions(**{**asked["stated"], "remove": tuple(asked["stated"]["remove"])})
     statement = statement_of(given)
-    made = make_evidence(Path("run.mcap"), statement, (*given.remove, *names_of_this_computer()),
+    made = make_evidence(Path(LOG), statement, (*given.remove, *names_of_this_computer()),
                          serial_key=Path(asked["key_file"]).read_bytes())
     with _put(ARCHIVE) as beside:
         beside.write_bytes(made.archive)
