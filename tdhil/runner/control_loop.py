@@ -35,6 +35,9 @@ SWITCH_CYCLES = 10
 NO_WORKER_PROCESS = "computations run in a thread beside the control loop, not in their own process"
 """Text of the log, before the reason. During a computation cycles may be late; there is no other effect."""
 
+MOST_SIDE_TROUBLES = 10
+"""Different errors of log, observer and display that a stop keeps. A text with a counter must not fill the memory."""
+
 
 Watcher = Callable[[Command, Sample], None]
 
@@ -49,7 +52,7 @@ class ControlLoop:
         self.guard = guard
         self.log = log
         self.period_s = drive.period_s
-        self.stop_side_troubles: list[str] = []
+        self.stop_side_troubles: list[str] = []     # errors of log, observer and display in the stop, each once
         self.last: Sample | None = None
         self.before: Sample | None = None            # the sample before ``last``
         self.observer: Watcher | None = None         # called by a stage after every cycle, after the guard
@@ -94,8 +97,9 @@ class ControlLoop:
                 if takes is not None:
                     takes(command, sample)
             except Exception as error:
-                self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
-                del self.stop_side_troubles[10:]
+                text, known = f"{type(error).__name__}: {error}", self.stop_side_troubles
+                if text not in known and len(known) < MOST_SIDE_TROUBLES:
+                    known.append(text)
         return sample
 
     def _note_remarks(self, command: Command, sample: Sample) -> None:

@@ -115,12 +115,13 @@ class Runner:
                 report = self._stop.run()
                 with suppress(Exception):
                     self._log.configure(stop={"confirmed": report.confirmed, "at_rest_s": report.at_rest_s})
+                beside = [f"error beside the stop, which went on: {one}" for one in report.beside]
                 with suppress(Exception):
-                    for trouble in (*report.trouble, *(f"error beside the stop: {one}" for one in report.beside)):
+                    for trouble in (*report.trouble, *beside):
                         self._log.event(self._drive.clock.now_s(), "stop", trouble)
-                for error_text in report.beside:
+                for error_text in beside:
                     with suppress(Exception):
-                        self._say(f"error beside the stop, which went on: {error_text}")
+                        self._say(error_text)
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
                 if cause is None and report.stayed_in_torque_mode:

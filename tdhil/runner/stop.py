@@ -340,7 +340,7 @@ class StopSequence:
 
     def _ended(self, confirmed: bool, at_rest_s: float | None, disabled: bool) -> StopReport:
         return StopReport(confirmed, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
-                          self._stayed_in_torque_mode, tuple(dict.fromkeys(self._loop.stop_side_troubles)))
+                          self._stayed_in_torque_mode, tuple(self._loop.stop_side_troubles))
 
     # -- with a drill string -----------------------------------------------------------------------------------
 

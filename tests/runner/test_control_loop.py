@@ -1,5 +1,6 @@
 """One cycle: guard, drive, log, guard, display; and what the helpers around it wait for."""
 
+import itertools
 import signal
 import threading
 import time
@@ -96,19 +97,25 @@ def test_a_mode_switch_is_confirmed_or_fails(world):
 
 
 def test_the_stop_cycle_is_neither_guarded_nor_stopped_by_log_or_display(world):
-    here = world()
+    here, count = world(), itertools.count()
 
-    def broken(*_):
+    def full(*_):
         raise OSError("disk full")
 
+    def no_terminal(*_):
+        raise ValueError(f"no terminal {next(count)}")
+
     here.stop_request.ask(signal.SIGINT)
-    for part in ("log", "display"):
-        here.log.on_cycle = broken if part == "log" else None
-        here.display.on_cycle = broken if part == "display" else None
-        for _ in range(20):
-            here.bench.stop_cycle(REST)
+    here.log.on_cycle = full
+    for _ in range(20):
+        here.bench.stop_cycle(REST)
+    assert here.bench.stop_side_troubles == ["OSError: disk full"]          # each is kept once
+    here.display.on_cycle = no_terminal
+    for _ in range(20):
+        here.bench.stop_cycle(REST)
     assert here.drive.cycles == 40
-    assert here.bench.stop_side_troubles == ["OSError: disk full"] * 10     # no more than ten are kept
+    different = [f"ValueError: no terminal {number}" for number in range(9)]
+    assert here.bench.stop_side_troubles == ["OSError: disk full", *different]      # and no more than ten of them
 
 
 def test_an_observer_that_fails_keeps_no_cycle_of_the_stop_from_the_log(world, monkeypatch):

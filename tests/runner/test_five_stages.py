@@ -175,5 +175,5 @@ def test_an_error_of_the_display_during_the_stop_is_told_once(world):
     result = here.runner(say=said.append).run()
     assert result.stop.confirmed
     text = "OSError: the terminal is gone"
-    assert [event[-1] for event in here.log.events].count(f"error beside the stop: {text}") == 1
+    assert [event[-1] for event in here.log.events].count(f"error beside the stop, which went on: {text}") == 1
     assert said.count(f"error beside the stop, which went on: {text}") == 1
