@@ -143,6 +143,7 @@ def service(tmp_path: Path, rigs: Path) -> Iterator[Service]:
     found = Service(tmp_path / "data", rigs)
     yield found
     for run in found.supervisor.live():
+        (found.store.place(run) / "rest").touch()       # one that brakes (`fake_run`) would do so for ever
         found.supervisor.stop(run, "end of the test")
     found.supervisor.close()
 
