@@ -235,7 +235,7 @@ def test_the_rounds_leave_a_place_without_lags(monkeypatch):
     assert stuck.theta[SPEED_LAG] < 1e-3
     assert stuck.theta[0] > 1.1 * 104.0
     monkeypatch.setattr(fitting, "from_residuals", lambda *_: noise)
-    monkeypatch.setattr(fitting, "_CLEAR", 0.0)
+    monkeypatch.setattr(fitting, "CLEAR", 0.0)
     monkeypatch.setattr(fitting, "_highest", lambda *_: 0.8)
     settled = fitting._settled(every, keep, stuck, 1.2)
     assert settled.fit.theta[SPEED_LAG] == pytest.approx(0.40, abs=0.1)

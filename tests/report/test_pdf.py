@@ -143,7 +143,7 @@ def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
 def test_its_text_can_be_read_by_others(tmp_path):
     (tmp_path / "r.pdf").write_bytes(pdf_bytes(report(full())))
     said = subprocess.run(["pdftotext", "-layout", tmp_path / "r.pdf", "-"], capture_output=True, text=True, check=True)
-    for wanted in ("J_r = 104.0 (99.9 to 108.1) kg·m² ±3.9 %", "Hall B · 2026-03-04 05:06:07 UTC+01:00", "987654",
+    for wanted in ("J_r = 104.0 (99.9 to 108.1) kg·m² ±4.0 %", "Hall B · 2026-03-04 05:06:07 UTC+01:00", "987654",
                    "friction <b>bends</b> & more", "0123456789abcdef", "page 1 of"):
         assert wanted in said.stdout, wanted
     assert said.stdout.count("SIMULATED") >= len(sheets_of(report(full())))

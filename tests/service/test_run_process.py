@@ -171,9 +171,9 @@ def test_a_stop_file_reaches_a_run_of_the_service(tmp_path, rigs):
     service = Service(tmp_path / "data", rigs, fake=False)
     begin = service.supervisor._begin
 
-    def left(run: str) -> None:
-        write_json(service.store.place(run) / STOP_FILE, {"by": "anna"})
-        begin(run)
+    def left(request: StoredRequest) -> None:
+        write_json(service.store.place(request.id) / STOP_FILE, {"by": "anna"})
+        begin(request)
 
     service.supervisor._begin = left
     service.supervisor.start()
