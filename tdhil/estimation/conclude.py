@@ -26,7 +26,7 @@ def conclude(case: Case, finding: Finding) -> Identification:
     warnings = (*case.warnings, *finding.warnings)
     stage = case.aborted
     if stage is not None:
-        said = f"the run was aborted in stage {stage.name}{f' ({stage.detail})' if stage.detail else ''}"
+        said = f"the run was {stage.aborted_text}"
         if inertia is not None:
             partial = f"{said}. The result uses the data recorded before"
             warnings = (CodedText(partial, MessageCode.RUN_ENDED_EARLY), *warnings)

@@ -6,6 +6,7 @@ another order, the results are equal to 1e-9.
 """
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -19,6 +20,7 @@ IntArray = NDArray[np.int64]
 ABORTED: Final = "aborted"
 """Outcome of a stage that did not reach its end."""
 
+_ERROR_CLASS: Final = re.compile(r"^[A-Z][A-Za-z]+: ")
 MARGIN_S: Final = 1.0
 """Time before an abort that is also left out, s, because a fault is in the signals before it is detected."""
 
@@ -152,6 +154,16 @@ class Stage:
     end_s: float
     outcome: str
     detail: str = ""
+
+    @property
+    def cause(self) -> str:
+        """Return the detail without the class of an error, which is for the log only."""
+        return _ERROR_CLASS.sub("", self.detail)
+
+    @property
+    def aborted_text(self) -> str:
+        """Return where and why the run ended, as the end of a sentence about the run."""
+        return f"aborted in stage {self.name}" + (f" ({self.cause})" if self.detail else "")
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from profiles import MessageCode, entry_of, with_code
+from profiles import CodedText, MessageCode, entry_of, with_code
 from tdhil.calibration import CalibrationUnusable, StoredCalibration
 from tdhil.config import STATED, expectations_in
 from tdhil.estimation import Estimate, FrequencyResponse, Identification, InertiaEstimate, Options, with_total
-from tdhil.recording import REHEARSAL, Recording
+from tdhil.recording import REHEARSAL, Recording, aborted_stage
 from tdhil.report.acceptance import acceptance_of
 from tdhil.report.inertia_scope import scope_of
 from tdhil.version import __version__
@@ -117,7 +117,14 @@ def speed_loop_present_of(run: Mapping[str, Any]) -> dict[str, Any] | None:
 def run_facts(
     recording: Recording, run: Mapping[str, Any], log: str, warnings: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return what the document of a run with a virtual string or with steps states of the run itself."""
+    """Return what the document of a run with a virtual string or with steps states of the run itself.
+
+    The first warning is that the run was aborted: its result uses the data recorded before.
+    """
+    stage = aborted_stage(recording)
+    if stage is not None:
+        warnings = (CodedText(f"the run was {stage.aborted_text}. The result uses the data recorded before",
+                              MessageCode.RUN_ENDED_EARLY), *warnings)
     return {
         "warnings": list(warnings),
         "warning_codes": _codes(warnings),

@@ -4,7 +4,6 @@ stdout.
 
 from __future__ import annotations
 
-import re
 import sys
 import threading
 import time
@@ -37,7 +36,6 @@ from tdhil.report.graphs import GRAPHS
 
 Job = Callable[[], None]
 
-_ERROR_CLASS = re.compile(r"^[A-Z][A-Za-z]+: ")
 MOST_LINES = 500
 """Longest queue of a terminal that accepts no lines; the oldest lines are dropped."""
 
@@ -275,8 +273,7 @@ class LiveDisplay:
     def stage_ended(self, stage: Stage) -> None:
         self._view = replace(self._view, ended={**self._view.ended, stage.name: stage})
         if not self._console.is_terminal:
-            # the detail of an aborted stage begins with the class of the error, which is only for the log
-            detail = f": {re.sub(_ERROR_CLASS, '', stage.detail)}" if stage.detail else ""
+            detail = f": {stage.cause}" if stage.detail else ""
             took = minutes(stage.end_s - stage.start_s)
             self._print(f"{self._prefix()}stage {stage.name} {stage.outcome}, {took}{detail}")
         else:

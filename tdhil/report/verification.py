@@ -12,7 +12,7 @@ from rich import box
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from tdhil.recording import Recording
+from tdhil.recording import Recording, aborted_stage
 from tdhil.report.blocks import (
     AnswerBox,
     Column,
@@ -52,6 +52,7 @@ _NEXT = {
     "cannot_tell": "Raise limits.torque_nm or limits.time_s within the machine's limits, or tune with narrower "
                    "intervals.",
 }
+_AFTER_ABORT = "Remove the cause of the abort, and repeat the run."
 _NAMES = {
     "overshoot_share": ("overshoot, %", 100.0), "rise_s": ("rise 10–90 %, s", 1.0), "settling_s": ("settling, s", 1.0),
     "gain_nm_s_rad": ("P, N·m·s/rad", 1.0), "integral_nm_rad": ("I, N·m/rad", 1.0),
@@ -63,11 +64,14 @@ def verification_document(
     warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Plain data for `json.dumps`, at the motor shaft; null in place of an infinite value."""
+    from tdhil.speed_loop import StepOutcome
+
+    ended_early = aborted_stage(recording) is not None and found.outcome is StepOutcome.CANNOT_TELL
     document = {
         "kind": "verification",
         "verdict": found.outcome.value,
         "reason": found.reason,
-        "next_step": _NEXT[found.outcome.value],
+        "next_step": _AFTER_ABORT if ended_early else _NEXT[found.outcome.value],
         "confidence": found.confidence,
         "rows": [{"name": row.name, "measured": asdict(row.measured), "predicted": asdict(row.predicted),
                   "within": row.within} for row in found.rows],

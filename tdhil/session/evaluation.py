@@ -135,15 +135,22 @@ def is_evaluation(run: Mapping[str, Any]) -> bool:
 def conclude_evaluation(
     rows: FloatArray, recording: Recording, run: Mapping[str, Any], log: str
 ) -> EvaluationConclusion:
-    """Evaluate from the log alone, the same live and in replay. Raises LogError if the log lacks data."""
+    """Evaluate from the log alone, the same live and in replay. Raises LogError if the log lacks data.
+
+    Of an aborted run only the time before the abort counts.
+    """
     from tdhil.estimation import torque_contradiction, torque_ratios
+    from tdhil.recording import aborted_stage, before_abort
     from tdhil.report import evaluation_document
-    from tdhil.soft_torque import EvaluationOutcome, SpeedProgram, case_of, evaluate
+    from tdhil.soft_torque import COLUMNS, EvaluationOutcome, SpeedProgram, case_of, evaluate
 
     try:
         asked = run["evaluation"]
         case, program = case_of(asked["case"]), SpeedProgram(**asked["program"])
-        signals = torque_contradiction(torque_ratios(recording, _CONFIDENCE), recording.torque_scale_rel_sd)
+        counts = before_abort(recording)
+        if aborted_stage(recording) is not None:
+            rows = rows[rows[:, COLUMNS.index("time_s")] <= counts.time_s[-1]]
+        signals = torque_contradiction(torque_ratios(counts, _CONFIDENCE), counts.torque_scale_rel_sd)
         found = evaluate(rows, case, program, "" if signals is None else f"{signals.reason}. Next: {signals.advice}")
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"contains no readable evaluation ({error})", where=log,

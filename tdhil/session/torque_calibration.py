@@ -195,7 +195,7 @@ def _refusal(runs: Sequence[CalibrationRun], identified: Sequence[Identification
         verdict, reason, advice = Verdict.NOT_IDENTIFIABLE, "", "run it again, and calibrate with the new log"
         stage = aborted_stage(run.record.recording)
         if stage is not None:
-            reason = f"it was aborted in stage {stage.name}" + (f" ({stage.detail})" if stage.detail else "")
+            reason = f"it was {stage.aborted_text}"
         elif not run.record.recording.complete:
             reason = "its log ends before the run did"
         elif found.inertia is None:

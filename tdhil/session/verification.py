@@ -66,7 +66,11 @@ def is_verification(run: Mapping[str, Any]) -> bool:
 
 
 def conclude_verification(recording: Recording, run: Mapping[str, Any], log: str) -> VerificationConclusion:
-    """Compare from the log alone, the same live and in replay. Raises LogError if the log lacks data."""
+    """Compare from the log alone, the same live and in replay. Raises LogError if the log lacks data.
+
+    The steps of an aborted run end before the abort: its stop would be taken for the response of a step.
+    """
+    from tdhil.recording import before_abort
     from tdhil.report import verification_document
     from tdhil.runner import step_record
     from tdhil.speed_loop import StepOutcome, StepProgram, step_case_of, verify_record
@@ -80,7 +84,7 @@ def conclude_verification(recording: Recording, run: Mapping[str, Any], log: str
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"contains no readable steps of the set speed ({error})", where=log,
                        next_step="Repeat the run") from None
-    found = verify_record(case, program, step_record(recording, starts, period_s, filter_s))
+    found = verify_record(case, program, step_record(before_abort(recording), starts, period_s, filter_s))
     document = verification_document(found, case, program, recording, run, log, run_warnings(run))
     codes = {StepOutcome.AGREES: ExitCode.OK, StepOutcome.DIFFERS: ExitCode.NOT_PASSED,
              StepOutcome.CANNOT_TELL: ExitCode.NOT_IDENTIFIABLE}

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode
+from tdhil.recording.recording import MARGIN_S
+from tdhil.session import read
+from tdhil.session.verification import conclude_verification
+from tdhil.speed_loop.verification import LEAST_PAIRS
 from tests.cli.test_tune import estimate
 from tests.cli.test_tune_speed import result
 from tests.rigs import plant_file
@@ -90,3 +95,23 @@ def test_a_run_finds_the_gain_that_was_typed_wrongly_and_its_replay_says_the_sam
     assert "SIMULATED" in text and text.count("<svg") == 1
     assert main(["replay", str(log)]) == code
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+    for pairs in (live["steps"]["counted_pairs"] - 3, 4):
+        check_aborted(log, live, pairs)
+
+
+def check_aborted(log, live, pairs):
+    """An abort in the step after ``pairs``, whose samples do not end there: the stop would be the step's response."""
+    record = read(log)
+    starts, half_s = record.configuration["verification"]["starts_s"], live["steps"]["half_s"]
+    end_s = starts[2 * pairs + 1] + half_s + MARGIN_S + 0.5 * half_s       # the first pair does not count
+    stages = tuple(replace(stage, outcome="aborted", end_s=end_s, detail="Interrupted: interrupted by Ctrl-C")
+                   if stage.name == "acquire" else stage for stage in record.recording.stages)
+    document = conclude_verification(replace(record.recording, stages=stages), record.configuration, "v").document
+    assert document["steps"]["counted_pairs"] == pairs
+    assert document["warnings"][0] == ("the run was aborted in stage acquire (interrupted by Ctrl-C). The result uses "
+                                       "the data recorded before")
+    if pairs < LEAST_PAIRS:
+        assert document["verdict"] == "cannot_tell"
+        assert document["next_step"] == "Remove the cause of the abort, and repeat the run."
+    else:
+        assert document["verdict"] == "differs"

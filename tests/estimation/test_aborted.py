@@ -11,7 +11,7 @@ from tests.estimation.analytic import closed_form
 
 pytestmark = pytest.mark.one_worker("default plan")      # its recording is one of 24 that are simulated at once
 
-DETAIL = "DriveFault: the drive left the state 'enabled' and shows 'off'"
+DETAIL = "the drive left the state 'enabled' and shows 'off'"
 
 
 def aborted(recording, time_s, tail):
@@ -29,7 +29,7 @@ def aborted(recording, time_s, tail):
         torque_nm=np.concatenate((recording.torque_nm[cut], -50.0 * (braking > 0.0))),
         fresh=np.concatenate((recording.fresh[cut], ones)),
         limited=np.concatenate((recording.limited[cut], ~ones)),
-        stages=(Stage("hold", 0.0, 0.0, "ok"), Stage("acquire", 0.0, time_s, "aborted", DETAIL)),
+        stages=(Stage("hold", 0.0, 0.0, "ok"), Stage("acquire", 0.0, time_s, "aborted", f"DriveFault: {DETAIL}")),
     )
 
 

@@ -24,7 +24,7 @@ def test_an_aborted_run_is_a_partial_result(sto):
     assert again.code == 3
     inertia = again.document["inertia_kg_m2"]
     assert inertia["low"] < 104.0 < inertia["high"]
-    assert "aborted in stage acquire (DriveFault: " in again.document["warnings"][0]
+    assert "aborted in stage acquire (statusword " in again.document["warnings"][0]
     assert again.document["ended"]["exit_code"] == 6
     assert again.document["ended"]["kind"] == "DriveFault"
 

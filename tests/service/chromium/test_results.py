@@ -428,7 +428,8 @@ def test_a_stopped_run_is_compared_and_each_verdict_has_its_colour(page, served,
     page.goto("/runs")
     rows = {run: page.locator("#runs tr", has=page.locator(f"a[href='/runs/{run}']")) for run in runs}
     rows[runs[0]].get_by_text("stopped, at standstill").wait_for()
-    colours = [rows[run].locator(".verdict:not(.acceptance)").evaluate("one => getComputedStyle(one).color") for run in runs]
+    colours = [rows[run].locator(".verdict:not(.acceptance)").evaluate("one => getComputedStyle(one).color")
+               for run in runs]
     assert len({*colours, page.evaluate("getComputedStyle(document.body).color")}) == 4
     assert rows[runs[0]].locator("th, td:not(.pick)").first.inner_text().startswith("Rig a")     # the rig comes first
     assert page.locator("thead th").nth(1).inner_text().strip().lower().startswith("rig")
