@@ -132,13 +132,13 @@ def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict
     from profiles import load_model
     from tdhil.calibration import calibrate_known_pipe
     from tdhil.estimation import Refused, measure_string
-    from tdhil.recording import Pipe
+    from tdhil.recording import Pipe, before_abort
     from tdhil.report import known_pipe_document
     from tdhil.soft_torque import StringFile
 
     record.require_motion()
     refuse_rehearsal(record)
-    recording = record.recording
+    recording = before_abort(record.recording)
     try:
         known = known_pipe_of(load_model(path, StringFile), recording.gear_ratio)
     except ValueError as error:

@@ -9,6 +9,7 @@ from tdhil.calibration import KnownPipe, PipeInput, calibrate_known_pipe
 from tdhil.estimation import MeasuredString
 from tdhil.estimation.frequency_domain import string_view
 from tdhil.estimation.result import Estimate
+from tdhil.recording import Stage
 from tdhil.report import PlainConsole, factor_report, print_factor, write_blocks
 from tdhil.session import find_by_known_pipe, known_pipe_of
 from tests.calibration.bodies import recording
@@ -116,6 +117,12 @@ def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
     factor = found["calibration_factor"]
     assert factor["low"] <= 1.0 / 1.04 <= factor["high"]
     assert factor["value"] == pytest.approx(1.0 / 1.04, rel=0.01)
+    end_s = 0.9 * float(reported.time_s[-1])
+    aborted = replace(reported, stages=(Stage("acquire", 0.0, end_s, "aborted", "Interrupted: by Ctrl-C"),))
+    parts = [find_by_known_pipe(replace(record, recording=replace(aborted, torque_nm=np.where(
+        reported.time_s < end_s - 1.0, reported.torque_nm, share * reported.torque_nm))), tmp_path / "measured.yaml",
+        0.95)["calibration_factor"] for share in (1.0, 0.0)]      # whatever follows the abort
+    assert parts[0] == parts[1] and parts[0]["low"] <= 1.0 / 1.04 <= parts[0]["high"]
     usual = find_by_known_pipe(record, tmp_path / "usual.yaml", 0.95)
     assert usual["calibration_factor"] is None and usual["measured_factor"] is not None
     assert "wider than" in usual["reason"]
