@@ -38,7 +38,7 @@ from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segment_means, widened
 from tdhil.estimation.result import AngleHarmonic, Estimate, normal_quantile
 from tdhil.estimation.samples import ALL_TIME, LONGEST_GAP, Samples, Stretch, angle_readings, usual_interval
-from tdhil.estimation.spectrum import ComplexArray
+from tdhil.estimation.spectrum import ComplexArray, unit_waves
 from tdhil.recording import FloatArray, Recording
 
 LEAST_GAIN = 40.0
@@ -503,7 +503,7 @@ class _AngleLines:
 def _lines(time: FloatArray, signal: FloatArray, start_s: float, omega: FloatArray) -> ComplexArray:
     """Return the lines (K,) of a signal over one period, from sums; the samples are nearly uniform."""
     centred = signal - signal.mean()
-    found: ComplexArray = np.exp(-1j * np.multiply.outer(omega, time - start_s)) @ centred * (2.0 / len(time))
+    found: ComplexArray = unit_waves(np.multiply.outer(-omega, time - start_s)) @ centred * (2.0 / len(time))
     return found
 
 

@@ -10,7 +10,7 @@ from tdhil.estimation.case import PeriodicCase
 from tdhil.estimation.friction_levels import Levels, warming_warning
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples, Stretch, excited_window, left_out_warnings
-from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
+from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, unit_waves
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -294,7 +294,7 @@ def _averaged(
     # samples before the first edge (a sample that is a rounding error early) belong to the first bin
     value[full] = np.add.reduceat(signal, own) / counts[full]
     when[full] = np.add.reduceat(period.time_s - start, own) / counts[full]
-    turned = np.exp(2j * np.pi * np.multiply.outer(when[full], np.asarray(lines_hz)))
+    turned = unit_waves(2.0 * np.pi * np.multiply.outer(when[full], np.asarray(lines_hz)))
     value[full] -= (turned @ lines).real
     return value, full
 

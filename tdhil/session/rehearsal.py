@@ -14,11 +14,11 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from profiles import MessageCode, with_code
-from tdhil.buses import PeerPlan, bus_named
 from tdhil.errors import ExitCode, exit_code
 
 if TYPE_CHECKING:
     from sim_bus import KnownFault, Scripted
+    from tdhil.buses import PeerPlan
     from tdhil.runner import RunOutcome
 
 
@@ -210,6 +210,8 @@ def judge_rehearsal(
     ``document``: the result, None if the run ended early; ``own_code``: exit code of the result; ``other_program``:
     the run has a virtual string or measures the drive's impedance.
     """
+    from tdhil.buses import bus_named
+
     kinds = {one.name: one for one in bus_named(drive).faults()}
     code = _code(outcome) if own_code is None else own_code
     by_hand = code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED)

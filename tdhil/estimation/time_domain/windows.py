@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 
 from tdhil.estimation.samples import Samples
+from tdhil.estimation.spectrum import unit_waves
 from tdhil.estimation.time_domain.taylor import ORDERS, ComplexArray, flat_top
 from tdhil.recording import BoolArray, FloatArray
 
@@ -227,7 +228,7 @@ def seen_through(window: TaperWindow, part: Samples, shape: FloatArray, s: Compl
         axis=1,
     )
     seen = np.concatenate([
-        np.exp(np.outer(-s[first : first + _CHUNK], time)) @ columns for first in range(0, len(s), _CHUNK)
+        unit_waves(np.outer(-s.imag[first : first + _CHUNK], time)) @ columns for first in range(0, len(s), _CHUNK)
     ])
     level = np.zeros((len(s), 2), dtype=np.complex128)
     level[:, 0 if window.run.direction > 0.0 else 1] = seen[:, 8]
