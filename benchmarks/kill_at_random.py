@@ -53,6 +53,9 @@ LASTS_S = {"setup": 3.5, "speed": 28.0, "torque": 8.5, "hold": 13.0, "acquire": 
 """About how long each stage takes, in plant time; stage 5 is made longer than any moment drawn (--periods 40)."""
 RATES_HZ = (50.0, 100.0, 250.0)
 MISSING_S = 0.5
+BACK_RAD_S = 0.1
+"""How far back the drive's own speed loop may swing at the end of its ramp. From 7.15 rad/s it was 0.046 to 0.054, from
+3 rad/s 0.03 (eight kills at 50 Hz). Without friction this loop (J 104, P 300, I 300) swings back by 0.48."""
 TRIES = 5
 REAL_RATE_HZ, REAL_WATCHDOG_S = 20.0, 2.0       # what a loaded machine still keeps
 REAL_LASTS_S = {"setup": 3.5, "speed": 12.0}
@@ -175,7 +178,7 @@ def _check_shaft(found: Outcome, shaft: Shaft) -> None:
         wrong.append(f"at rest after {found.rest_s:.2f} s, allowed are {found.allowed_s:.2f} s")
     after = shaft.time_s >= silent_s
     fastest = found.speed_rad_s + plan.watchdog_s * TORQUE_NM / INERTIA
-    if shaft.speed_rad_s[after].max() > fastest or shaft.speed_rad_s[after].min() < -0.05:
+    if shaft.speed_rad_s[after].max() > fastest or shaft.speed_rad_s[after].min() < -BACK_RAD_S:
         wrong.append("the shaft went faster or further back than the last setpoint can make it go")
     try:
         shaft.assert_at_rest()
