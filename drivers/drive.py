@@ -141,6 +141,11 @@ class DriveLimits:
     string: bool = False                   # a drill string is attached; trapped torque is refused
     noise_scale_rad_s: float = 0.0         # its shares count as noise at standstill, if it is above ``speed_rad_s``
 
+    @property
+    def standstill_scale_rad_s(self) -> float:
+        """Return the speed whose shares count as noise at standstill: a slow run does not quieten the signal."""
+        return max(self.speed_rad_s, self.noise_scale_rad_s)
+
 
 @dataclass(frozen=True)
 class ReportingFilters:

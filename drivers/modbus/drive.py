@@ -191,9 +191,7 @@ class ModbusDrive:
                 self._where, "The drive's own impedance can be measured from its reference (--impedance reference)",
             )
         found, scales, rated_nm = checks.read_only_checks(
-            table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm,
-            limits.accept_no_watchdog, string=limits.string,
-        )
+            table, access, profile, self._given, self._rated_torque_nm, limits)
         watched, shared = True, False
         own = OwnLimits(limits.accept_wider)
         filters = find_filters(table, profile, found)
@@ -231,8 +229,7 @@ class ModbusDrive:
             self._watchdog_s, self._quick_stop_rad_s2 = limits.watchdog_s, limits.quick_stop_rad_s2
             self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
         scales = self._codec.scales
-        scale_rad_s = max(limits.speed_rad_s, limits.noise_scale_rad_s)
-        self._standstill = ZeroSpeed(scales.speed, scale_rad_s, self.period_s)
+        self._standstill = ZeroSpeed(scales.speed, limits.standstill_scale_rad_s, self.period_s)
         self._ticks = Ticks(self.clock, self.period_s, BUDGET_SHARE * self._watchdog_s)
         self._late_before = late_replies(self._link)
         target = profile.cycle.torque_setpoint

@@ -136,11 +136,10 @@ MODE_POLLS, MODE_POLL_S = 20, 0.05
 
 def read_only_checks(
     table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, given: Mapping[str, float],
-    rated_torque_nm: float | None,
-    speed_limit_rad_s: float, torque_limit_nm: float, accept_no_watchdog: bool = False, *, string: bool = False,
+    rated_torque_nm: float | None, limits: DriveLimits,
 ) -> tuple[Parameters, Scales | None, float]:
     """Run all checks that need no write. Scales are None if a row is refused."""
-    spared = watchdogs_own(access, profile, given) if accept_no_watchdog else frozenset()
+    spared = watchdogs_own(access, profile, given) if limits.accept_no_watchdog else frozenset()
     found = read_parameters(table, access, profile, given, spared)
     rated_nm = find_rated_torque(table, profile, found, rated_torque_nm)
     check_required(table, profile, found, spared)
@@ -153,10 +152,10 @@ def read_only_checks(
             "profile, cycle", "See the rows above",
         )
     if scales is not None:
-        check_resolution(table, profile, scales, speed_limit_rad_s, torque_limit_nm)
-        check_state(table, access, profile, scales, speed_limit_rad_s)
-        if string:
-            check_string(table, access, profile, scales, torque_limit_nm)
+        check_resolution(table, profile, scales, limits)
+        check_state(table, access, profile, scales, limits.standstill_scale_rad_s)
+        if limits.string:
+            check_string(table, access, profile, scales, limits.torque_nm)
     refused = any(check.outcome is Outcome.REFUSED for check in table.checks)
     if refused:
         table.note("settings", "nothing was written to the drive: correct the rows above first", "driver")
@@ -180,13 +179,13 @@ def watchdogs_own(access: RegisterAccess, profile: ModbusProfile, given: Mapping
 
 
 def check_resolution(
-    table: PreflightTable, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float, torque_limit_nm: float
+    table: PreflightTable, profile: ModbusProfile, scales: Scales, limits: DriveLimits
 ) -> None:
     """Refuse counts that are too coarse for the limits: the scale was read in the wrong order or place."""
     cycle = profile.cycle
     pairs = (
-        ("speed", cycle.speed, scales.speed, speed_limit_rad_s, "rad/s"),
-        ("torque", cycle.torque, scales.torque, torque_limit_nm, "N·m"),
+        ("speed", cycle.speed, scales.speed, limits.speed_rad_s, "rad/s"),
+        ("torque", cycle.torque, scales.torque, limits.torque_nm, "N·m"),
     )
     for name, signal, count, limit, unit in pairs:
         if count > COARSEST_SHARE * limit:
@@ -199,7 +198,7 @@ def check_resolution(
 
 
 def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales,
-                speed_limit_rad_s: float) -> None:
+                standstill_scale_rad_s: float) -> None:
     """Refuse a drive in fault (it is never reset silently).
 
     Also refuse a turning shaft, and a drive that the field bus does not control.
@@ -209,7 +208,7 @@ def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusPr
     status = access.read(register) & 0xFFFF
     power = power_state(decode(control, status))
     speed_rad_s = access.read(cycle.speed.register_) * scales.speed
-    still_rad_s = min(max(STILL_COUNTS * scales.speed, STILL_SHARE * speed_limit_rad_s), STANDSTILL_RAD_S)
+    still_rad_s = min(max(STILL_COUNTS * scales.speed, STILL_SHARE * standstill_scale_rad_s), STANDSTILL_RAD_S)
     if abs(speed_rad_s) > still_rad_s:
         readings = [access.read(cycle.speed.register_) * scales.speed for _ in range(STILL_READINGS)]
         speed_rad_s = sorted(readings, key=abs)[STILL_READINGS // 2]

@@ -172,6 +172,14 @@ def test_one_reading_of_noise_is_no_turning_shaft(bank, generic, first):
     assert "0.105 rad/s" in refused(bank, generic)["state"].found
 
 
+def test_a_slow_run_takes_the_noise_of_the_rig_for_noise(bank, generic):
+    """--highest-speed: the run's limit is lower, and the signal at rest is the same."""
+    bank.feedback = lambda: (40, 0)         # 0.042 rad/s: 0.4 % of the rig's limit of 10 rad/s
+    slow = dataclasses.replace(LIMITS, speed_rad_s=3.0)
+    assert "state" in refused(bank, generic, slow)
+    assert "state" not in refused(bank, generic, dataclasses.replace(slow, noise_scale_rad_s=10.0))
+
+
 def test_a_fault_reaction_is_refused(bank, generic):
     bank.on_show = lambda words: words.update({STATUS: 0x021F})
     row = refused(bank, generic)["state"]

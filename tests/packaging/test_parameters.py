@@ -20,7 +20,6 @@ EXCEPTIONS = {
     "drivers/cia402/limits.py: _limit": 11,
     "drivers/cia402/preflight.py: report": 10,
     "drivers/modbus/preflight.py: _check_one": 10,
-    "drivers/modbus/preflight.py: read_only_checks": 9,
     "drivers/own_limits.py: written": 10,
     "sim_bus/canopen/simulator.py: __init__": 9,
     "tdhil/config/options.py: option": 18,
