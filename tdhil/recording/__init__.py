@@ -38,7 +38,7 @@ if TYPE_CHECKING:
         LagPrior as LagPrior, Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment,
         Stage as Stage, SteppedSetpoint as SteppedSetpoint,
         TorqueAnswer as TorqueAnswer, ABORTED as ABORTED, aborted_stage as aborted_stage,
-        before_abort as before_abort,
+        before_abort as before_abort, counts_until_s as counts_until_s,
     )
     from tdhil.recording.run_log import RunEnd as RunEnd, RunLog as RunLog, find_ended as find_ended
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
@@ -59,7 +59,7 @@ else:
         "mcap_container": "MAGIC schema_of",
         "npz_cache": "pack_recording unpack_recording",
         "recording": "BoolArray Excitation FloatArray ImpedanceInput IntArray LagPrior Level Pipe Ramp Recording "
-                     "Segment Stage SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort",
+                     "Segment Stage SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort counts_until_s",
         "run_log": "RunEnd RunLog find_ended",
         "salvage": "Salvage examine write_copy",
         "trace_log": "write_trace_log",

@@ -215,16 +215,21 @@ def aborted_stage(recording: Recording) -> Stage | None:
     return next((stage for stage in recording.stages if stage.outcome == ABORTED), None)
 
 
+def counts_until_s(recording: Recording) -> float:
+    """Return the time at which an aborted run ceases to count, s; infinite for any other run."""
+    stage = aborted_stage(recording)
+    return stage.end_s - MARGIN_S if stage is not None and math.isfinite(stage.end_s) else math.inf
+
+
 def before_abort(recording: Recording) -> Recording:
     """Return the part for the identification: up to a moment before the first aborted stage ended, or everything.
 
     The recording of an aborted run includes the stop: samples of braking and of standstill follow those of the planned
     motion. Segments end with their last whole period.
     """
-    stage = aborted_stage(recording)
-    if stage is None or not math.isfinite(stage.end_s):
+    end_s = counts_until_s(recording)
+    if end_s == math.inf:
         return recording
-    end_s = stage.end_s - MARGIN_S
     # times that do not rise are refused later, by the checks of samples; nothing is sorted or searched here
     kept = recording.time_s < end_s
     excitation = recording.excitation

@@ -140,7 +140,7 @@ def conclude_evaluation(
     Of an aborted run only the time before the abort counts.
     """
     from tdhil.estimation import torque_contradiction, torque_ratios
-    from tdhil.recording import aborted_stage, before_abort
+    from tdhil.recording import before_abort, counts_until_s
     from tdhil.report import evaluation_document
     from tdhil.soft_torque import COLUMNS, EvaluationOutcome, SpeedProgram, case_of, evaluate
 
@@ -148,8 +148,7 @@ def conclude_evaluation(
         asked = run["evaluation"]
         case, program = case_of(asked["case"]), SpeedProgram(**asked["program"])
         counts = before_abort(recording)
-        if aborted_stage(recording) is not None:
-            rows = rows[rows[:, COLUMNS.index("time_s")] <= counts.time_s[-1]]
+        rows = rows[rows[:, COLUMNS.index("time_s")] < counts_until_s(recording)]
         signals = torque_contradiction(torque_ratios(counts, _CONFIDENCE), counts.torque_scale_rel_sd)
         found = evaluate(rows, case, program, "" if signals is None else f"{signals.reason}. Next: {signals.advice}")
     except (KeyError, TypeError, ValueError) as error:

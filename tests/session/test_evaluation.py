@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from tdhil.errors import LogError
 from tdhil.recording import Stage
 from tdhil.recording.recording import MARGIN_S
 from tdhil.session.evaluation import conclude_evaluation
@@ -31,3 +32,11 @@ def test_what_follows_an_abort_does_not_count(end_s, trials):
     assert np.isclose(found["loop"]["unknown_rms_nm"], before.unknown_rms_nm)
     assert found["warnings"][0] == ("the run was aborted in stage acquire (interrupted by Ctrl-C). The result uses the "
                                     "data recorded before")
+
+
+def test_a_run_that_was_aborted_at_once_has_no_evaluation():
+    log = rows(57.0, (60.0,), damping=0.22)
+    stages = (Stage("acquire", 0.0, 0.5, "aborted", "Interrupted: interrupted by Ctrl-C"),)
+    run = RUN | {"evaluation": {"case": CASE.plain(), "program": asdict(PROGRAM)}}
+    with pytest.raises(LogError, match="the virtual string was never turned"):
+        conclude_evaluation(log, recording(len(log) * 10, stages=stages), run, "run.mcap")
