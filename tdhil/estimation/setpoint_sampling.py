@@ -23,18 +23,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
 from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Finding
 from tdhil.estimation.result import BudgetLine
+from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
 NEGLIGIBLE = 1e-3         # share of J
 _FINE = 32                # grid steps of a cycle
-_LONGEST_S = 40.0         # s; duration of the simulated response
 _MOST = 0.5               # share of J; a larger error gives no number
 
 
@@ -68,17 +67,19 @@ def worst_share(stepped: SteppedSetpoint, torque_lag_s: float) -> float:
     return min(worst, _MOST) if math.isfinite(worst) else _MOST
 
 
-@lru_cache(maxsize=16)
 def _shares(stepped: SteppedSetpoint, torque_lag_s: float) -> FloatArray:
-    """Return J_read/J − 1 (_FINE + 1,) at the moments 0 to T after a step.
+    """Return J_read/J − 1 (_FINE + 1,) at the moments 0 to T after a step; all are infinite for an unstable response.
 
-    The result is cached, because the momentum cross-check uses the same loops several times.
+    With g = Σ r_i e^(p_i t), the sum over the cycles is a geometric series: Σ_n g(ε + n T) = Σ r_i e^(p_i ε)/(1 −
+    e^(p_i T)).
     """
-    _, answer = _answer(stepped, torque_lag_s)
-    sums = stepped.period_s * answer.reshape(-1, _FINE).sum(axis=0)
-    # just before a step the sum is that at the step itself, without the first value of the response
-    every: FloatArray = np.append(sums, sums[0] - stepped.period_s * answer[0]) - 1.0
-    every.flags.writeable = False
+    poles, residues = _response(stepped, torque_lag_s)
+    period_s = stepped.period_s
+    if not np.all(poles.real < 0.0):
+        return np.full(_FINE + 1, math.inf)
+    after_s = np.arange(_FINE + 1) / _FINE * period_s
+    series = residues / -np.expm1(poles * period_s)
+    every: FloatArray = period_s * (np.exp(np.multiply.outer(after_s, poles)) @ series).real - 1.0
     return every
 
 
@@ -116,20 +117,21 @@ def reading_share(
 ) -> ReadingShare:
     """Return the share over the moments of reading that the skew allows, and over ``loops``, which are equally likely.
 
-    Without a skew every moment of a cycle is equally likely, and the mean share is 0. ``torque_lag_s``: lag of the
-    torque report, used if ``moment`` is None.
+    Without a skew every moment of a cycle is equally likely, and the mean share is 0. An unstable loop may add any
+    share. ``torque_lag_s``: lag of the torque report, used if ``moment`` is None.
     """
     lag_s = torque_lag_s if moment is None else moment.torque_lag_s
     shares, weights = [], []
     for stepped in loops:
-        ends = np.clip(_shares(stepped, lag_s), -_MOST, _MOST)
+        ends = _shares(stepped, lag_s)
+        if not np.all(np.isfinite(ends)):
+            return ReadingShare(0.0, _MOST)
+        ends = np.clip(ends, -_MOST, _MOST)
         shares.append(0.5 * (ends[1:] + ends[:-1]))
         weights.append(np.ones(_FINE) / _FINE if moment is None else _likely(stepped.period_s, moment))
     share, weight = np.concatenate(shares), np.concatenate(weights) / len(loops)
     mean = float(weight @ share)
     sd = math.sqrt(float(weight @ (share - mean) ** 2))
-    if not math.isfinite(mean + sd):
-        return ReadingShare(0.0, _MOST)
     return ReadingShare(mean, sd) if max(abs(mean), sd) >= NEGLIGIBLE else EXACT_READING
 
 
@@ -167,25 +169,19 @@ def usual_loops(period_s: float) -> tuple[SteppedSetpoint, ...]:
     return tuple(loops)
 
 
-def _answer(stepped: SteppedSetpoint, lag_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return the times (N,), _FINE a cycle, and g, 1/s: (1 + b s)/((1 + a₁ s + a₂ s²)(1 + τ s)), by its poles."""
-    step = stepped.period_s / _FINE
-    count = math.ceil(_LONGEST_S / stepped.period_s) * _FINE
-    time = np.asarray(np.arange(count) * step, dtype=np.float64)
+def _response(stepped: SteppedSetpoint, lag_s: float) -> tuple[ComplexArray, ComplexArray]:
+    """Return poles p (R,), 1/s, and residues r (R,), 1/s, of g: (1 + b s)/((1 + a₁ s + a₂ s²)(1 + τ s))."""
     # a lag as short as a step of the grid counts as none, and two poles must not coincide
     poles = np.roots([stepped.second_s2, stepped.first_s, 1.0])
     if abs(poles[0] - poles[1]) < 1e-3 * abs(poles[0]):
         poles = poles * np.array([0.999, 1.001])
     gain = 1.0 / stepped.second_s2
-    if lag_s > step:
+    if lag_s > stepped.period_s / _FINE:
         fast = -1.0 / lag_s
         if np.min(np.abs(poles - fast)) < 1e-3 * abs(fast):
             fast *= 1.003
         gain *= -fast
         poles = np.append(poles, fast)
-    parts = []
-    for index, pole in enumerate(poles):
-        residue = gain * (1.0 + stepped.zero_s * pole) / np.prod(pole - np.delete(poles, index))
-        parts.append((residue * np.exp(pole * time)).real)
-    answer: FloatArray = np.sum(np.array(parts, dtype=np.float64), axis=0)
-    return time, answer
+    residues = [gain * (1.0 + stepped.zero_s * pole) / np.prod(pole - np.delete(poles, index))
+                for index, pole in enumerate(poles)]
+    return poles.astype(np.complex128), np.array(residues, dtype=np.complex128)

@@ -19,7 +19,7 @@ from tdhil.recording.recording import SteppedSetpoint
 FINE = 64
 
 
-def read_shares(stepped, lag_s):
+def read_shares(stepped, lag_s, longest_s=100.0):
     """J_read/J − 1 at every moment of a cycle, of a uniform acceleration in steps: the answers to all steps so far.
 
     The answer to one of them is made in the time domain by a library, not by residues.
@@ -27,7 +27,7 @@ def read_shares(stepped, lag_s):
     top = np.array([stepped.zero_s, 1.0, 0.0])
     bottom = np.polymul([stepped.second_s2, stepped.first_s, 1.0], [lag_s, 1.0])
     numerator, denominator, _ = cont2discrete((top, bottom), stepped.period_s / FINE)
-    cycles = int(100.0 / stepped.period_s)
+    cycles = int(longest_s / stepped.period_s)
     answer = lfilter(numerator.ravel(), denominator, np.ones(cycles * FINE))
     return stepped.period_s * answer.reshape(cycles, FINE).sum(axis=0) - 1.0
 
@@ -42,6 +42,17 @@ def test_the_worst_share_is_the_worst_moment_s(gain, damping, period_s, lag_s):
     stepped = SteppedSetpoint(period_s, gain / integral, gain / integral, 1.0 / integral)
     seen = float(np.max(np.abs(read_shares(stepped, lag_s))))
     assert worst_share(stepped, lag_s) == pytest.approx(seen, rel=0.1, abs=3e-4)
+
+
+def test_a_slow_response_counts_to_its_end():
+    slow = SteppedSetpoint(0.25, 32.2, 58.2, 95.0)      # a pole at 0.017 rad/s: 9 % of its response is left after 40 s
+    assert worst_share(slow, 0.05) == pytest.approx(float(np.max(np.abs(read_shares(slow, 0.05, 600.0)))), rel=0.1)
+
+
+def test_an_unstable_loop_may_add_any_share():
+    unstable = SteppedSetpoint(0.1, 1.0, -1.0, 1.0)
+    assert worst_share(unstable, 0.1) == 0.5
+    assert reading_share((*usual_loops(0.1), unstable), None, 0.1).sd == 0.5
 
 
 def test_it_vanishes_with_a_short_cycle_and_with_lag():
