@@ -30,7 +30,8 @@ if TYPE_CHECKING:
         messages_in as messages_in,
     )
     from tdhil.recording.log_writer import RunWriter as RunWriter
-    from tdhil.recording.mcap_container import MAGIC as MAGIC, schema_of as schema_of
+    from tdhil.recording.mcap_container import schema_of as schema_of
+    from tdhil.recording.mcap_records import MAGIC as MAGIC
     from tdhil.recording.npz_cache import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, ImpedanceInput as ImpedanceInput,
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
         TorqueAnswer as TorqueAnswer, ABORTED as ABORTED, aborted_stage as aborted_stage,
         before_abort as before_abort, counts_until_s as counts_until_s,
     )
-    from tdhil.recording.run_log import RunEnd as RunEnd, RunLog as RunLog, find_ended as find_ended
+    from tdhil.recording.run_end import RunEnd as RunEnd, find_ended as find_ended
+    from tdhil.recording.run_log import RunLog as RunLog
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
     from tdhil.recording.trace_log import write_trace_log as write_trace_log
 else:
@@ -56,11 +58,13 @@ else:
         "log_reader": "read_cycles read_frames read_run",
         "log_tail": "LogChunks LoggedMessage LogNews LogTail messages_in",
         "log_writer": "RunWriter",
-        "mcap_container": "MAGIC schema_of",
+        "mcap_container": "schema_of",
+        "mcap_records": "MAGIC",
         "npz_cache": "pack_recording unpack_recording",
         "recording": "BoolArray Excitation FloatArray ImpedanceInput IntArray LagPrior Level Pipe Ramp Recording "
                      "Segment Stage SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort counts_until_s",
-        "run_log": "RunEnd RunLog find_ended",
+        "run_end": "RunEnd find_ended",
+        "run_log": "RunLog",
         "salvage": "Salvage examine write_copy",
         "trace_log": "write_trace_log",
     })

@@ -17,7 +17,6 @@ import zstandard
 from tdhil.errors import LogBroken
 from tdhil.recording.log_format import CHANNELS, CLASSES, RAW_FRAMES, SAMPLE
 from tdhil.recording.log_reader import Ours, messages
-from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -26,6 +25,7 @@ from tdhil.recording.mcap_records import (
     DATA_END,
     FOOTER,
     HEADER,
+    MAGIC,
     MESSAGE,
     MESSAGE_INDEX,
     METADATA,

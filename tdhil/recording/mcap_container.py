@@ -27,9 +27,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Schema, Statistics, SummaryOffset
 
 from tdhil.recording.log_format import CHANNELS, CLASSES, PACKAGE, schema_name
+from tdhil.recording.mcap_records import MAGIC
 from tdhil.version import __version__
 
-MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = f"{PACKAGE} {__version__}"
 _MESSAGE: Final = Struct("<BQHIQQ")
 _INDEX: Final = Struct("<BQHI")

@@ -20,7 +20,6 @@ from zlib import crc32
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
-from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.mcap_records import (
     ATTACHMENT,
     CHUNK,
@@ -28,6 +27,7 @@ from tdhil.recording.mcap_records import (
     FOOTER,
     HEADER,
     KNOWN,
+    MAGIC,
     MESSAGE_INDEX,
     METADATA,
     RECORD_HEAD,

@@ -17,7 +17,8 @@ from tdhil.errors import ExitCode, Interrupted, LogBroken, exit_code
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.recording import Stage
-from tdhil.recording.run_log import RunLog, find_ended
+from tdhil.recording.run_end import find_ended
+from tdhil.recording.run_log import RunLog
 from tdhil.runner.stop import StopReport
 from tdhil.runner.task import RunOutcome
 from tdhil.service.run_state import State, end_of

@@ -29,7 +29,8 @@ from tdhil.recording.log_messages import (
     stage_message,
 )
 from tdhil.recording.log_reader import read_run
-from tdhil.recording.mcap_container import LIBRARY, MAGIC
+from tdhil.recording.mcap_container import LIBRARY
+from tdhil.recording.mcap_records import MAGIC
 from tdhil.recording.recording import Stage
 from tests.recording.log_runs import frames, make_run, same, same_run, sample
 

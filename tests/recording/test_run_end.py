@@ -9,7 +9,8 @@ from tdhil.errors import Interrupted, exit_code
 from tdhil.recording.log_format import Event
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.run_log import RunLog, find_ended
+from tdhil.recording.run_end import find_ended
+from tdhil.recording.run_log import RunLog
 
 ERRORS = [
     PreflightRefused("wanted 1, found 2", where="6502h", next_step="Choose the profile"),
