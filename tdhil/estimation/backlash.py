@@ -159,16 +159,16 @@ class _GapMotion:
         moved, gained = 0.5 * dt**2 * drive, dt * drive
         place, rate = np.ones(len(self.slope)), np.zeros(len(self.slope))
         seen = np.empty((steps, len(place)))
+        # what a step gains against the flank is no speed to rebound with
+        least, kept = 2.0 * np.abs(gained), -self.rebound
         for _ in range(2):
-            for n in range(steps):
-                seen[n] = place
-                place = place + dt * rate + moved[n]
-                rate = rate + gained[n]
+            for now, move, gain, rebounds in zip(seen, moved, gained, least, strict=True):
+                now[:] = place
+                place = place + dt * rate + move
+                rate = rate + gain
                 hit = np.abs(place) >= 1.0
-                # what a step gains against the flank is no speed to rebound with
-                fast = np.abs(rate[hit]) > 2.0 * np.abs(gained[n, hit])
-                rate[hit] = np.where(fast, -self.rebound[hit] * rate[hit], 0.0)
-                place = np.clip(place, -1.0, 1.0)
+                rate = np.where(hit, np.where(np.abs(rate) > rebounds, kept * rate, 0.0), rate)
+                place = np.minimum(np.maximum(place, -1.0), 1.0)
         lines: ComplexArray = np.fft.rfft(seen, axis=0)[1 : len(segment.theta) + 1].T * (2.0 / steps)
         return lines
 

@@ -118,11 +118,11 @@ class PeriodInstants:
         return [unit_waves(np.multiply.outer(angle, self.lines_hz)) for angle in self._angles]
 
     def at_harmonics(self, harmonics: FloatArray) -> list[NDArray[np.complex128]]:
-        """Return 2 e^(−jω_h t) of each period, (H, N), for H harmonics of the period."""
+        """Return e^(−jω_h t) of each period, (H, N), for H harmonics of the period."""
         if not np.array_equal(harmonics, self._harmonics):
             self._harmonics = harmonics
             self._at_harmonics = [
-                2.0 * unit_waves(np.multiply.outer(-harmonics / self.period_s, angle)) for angle in self._angles
+                unit_waves(np.multiply.outer(-harmonics / self.period_s, angle)) for angle in self._angles
             ]
         return self._at_harmonics
 
@@ -154,7 +154,7 @@ def repeating_rounding(
     if last < first + _FEWEST:
         return most
     harmonics = np.unique(np.round(np.geomspace(first, last, _LOOKED_FOR)))    # most of them are near the lines
-    unexcited = np.array([turned @ rest / len(rest)
+    unexcited = np.array([2.0 * (turned @ rest) / len(rest)
                           for rest, turned in zip(rests, instants.at_harmonics(harmonics), strict=True)])
     again = np.abs(unexcited.mean(axis=0)) ** 2 - np.var(unexcited, axis=0, ddof=1) / len(unexcited)
     return min(max(float(np.mean(again)), 0.0), most)

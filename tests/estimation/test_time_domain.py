@@ -63,6 +63,16 @@ def test_without_noise_the_truth_solves_every_bin():
     assert np.sum(np.abs(evaluate(wrong, bins).error[low]) ** 2) > 20.0 * np.sum(error**2)
 
 
+def test_a_bin_is_the_integral_through_the_window_at_every_frequency(steps):
+    window = windows_of(steps)[0]
+    part, bins = window.part(0.0, window.length_s), measure(window)
+    time = part.time_s - window.start_s
+    assert len(bins) > 200
+    waves = np.exp(-2j * np.pi * np.outer(bins.hertz, time)) * window.shape(time)[:, 0]
+    for seen, signal in ((bins.speed[:, 0], part.speed_rad_s), (bins.torque[:, 0], part.torque_nm)):
+        assert np.max(np.abs(seen - np.trapezoid(waves * signal, time, axis=1))) < 1e-11 * np.max(np.abs(seen))
+
+
 @pytest.mark.parametrize(("rate_hz", "length_s"), [(20.0, 2.0), (10.0, 5.0), (20.0, 12.0), (400.0, 2.0)])
 def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, length_s):
     """Ten samples to a taper: sums over them had been off by several percent of the torque, and J followed."""

@@ -107,7 +107,7 @@ _MOST_BINS = 400          # most bins of a window
 _RATE_SHARE = 0.2         # of the sampling rate: the highest frequency used
 _OF_TAPER = 100           # samples of a taper: with fewer the sums with a window's third derivative are not integrals
 _COINCIDENT = 0.3         # of the usual interval: a spline through closer samples would oscillate
-_CHUNK = 64               # frequencies at once, to limit the memory
+_CHUNK = 64               # frequencies at once
 _LEAST_SAMPLES = 32       # fewest samples of a window
 
 
@@ -205,30 +205,30 @@ def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[TaperWindow, ...]:
 
 
 def measure(window: TaperWindow) -> Bins:
-    """Return the bins of a window at all its frequencies."""
+    """Return the bins of a window at all its frequencies.
+
+    These are multiples of one frequency, so that e^(−j(ω_m + ω_k) t) = e^(−jω_m t) e^(−jω_k t): the waves of the first
+    frequencies serve all others, if the signals are turned by ω_m before.
+    """
     part = window.part(0.0, window.length_s)
-    time = part.time_s - window.start_s
+    time, speed, torque = part.time_s - window.start_s, part.speed_rad_s, part.torque_nm
     rate = len(time) / window.finer / float(time[-1] - time[0])
     highest = min(_RATE_SHARE * rate, _MOST_BINS / window.hop_s)
-    frequencies = np.arange(math.floor(highest * window.hop_s) + 1) / window.hop_s
-    s = np.asarray(2j * math.pi * frequencies, dtype=np.complex128)
-    return seen_through(window, part, window.shape(time), s)
-
-
-def seen_through(window: TaperWindow, part: Samples, shape: FloatArray, s: ComplexArray) -> Bins:
-    """Return the samples ``part`` (N) through ``shape`` (N, 4), a test function and its derivatives, at ``s`` (M,)."""
-    time, speed, torque = part.time_s - window.start_s, part.speed_rad_s, part.torque_nm
+    s = np.asarray(2j * math.pi * np.arange(math.floor(highest * window.hop_s) + 1) / window.hop_s, dtype=np.complex128)
     step = np.empty_like(time)
     step[1:-1] = 0.5 * (time[2:] - time[:-2])
     step[0], step[-1] = 0.5 * (time[1] - time[0]), 0.5 * (time[-1] - time[-2])
+    shape = window.shape(time)
     weights = shape * np.array([1.0, -1.0, 1.0, -1.0]) * step[:, None]
     columns = np.concatenate(
         [weights * speed[:, None], weights * torque[:, None], weights[:, :1],
          weights * (speed * np.abs(speed))[:, None]],
         axis=1,
     )
+    waves = unit_waves(np.outer(-s.imag[:_CHUNK], time))
     seen = np.concatenate([
-        unit_waves(np.outer(-s.imag[first : first + _CHUNK], time)) @ columns for first in range(0, len(s), _CHUNK)
+        waves[: len(s) - first] @ (unit_waves(-s.imag[first] * time)[:, None] * columns)
+        for first in range(0, len(s), _CHUNK)
     ])
     level = np.zeros((len(s), 2), dtype=np.complex128)
     level[:, 0 if window.run.direction > 0.0 else 1] = seen[:, 8]
