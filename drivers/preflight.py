@@ -69,8 +69,12 @@ def settle(table: PreflightTable, tried: PreflightTable, accepted: bool, is_off:
         table.checks += [_noted(check) for check in tried.checks]
         table.note("no watchdog", f"{ACCEPTED_BY}: {NOTHING_STOPS_IT}", refused[-1].where)
         return False
-    hint = _NOT_OFF if accepted else _HINT
-    table.checks += [_hinted(check, hint) if refused and check is refused[-1] else check for check in tried.checks]
+    if refused:
+        last, hint = refused[-1], _NOT_OFF if accepted else _HINT
+        before = last.next_step and last.next_step + ("" if last.next_step.endswith((".", "?", "!")) else ".") + " "
+        hinted = replace(last, next_step=before + hint)
+        tried.checks = [hinted if check is last else check for check in tried.checks]
+    table.checks += tried.checks
     return not refused
 
 
@@ -83,11 +87,6 @@ def _noted(check: Check) -> Check:
     if check.outcome is not Outcome.REFUSED:
         return check
     return replace(check, found=f"{check.found}; {ACCEPTED_BY}", outcome=Outcome.NOTE, next_step="")
-
-
-def _hinted(check: Check, hint: str) -> Check:
-    before = check.next_step and check.next_step + ("" if check.next_step.endswith((".", "?", "!")) else ".") + " "
-    return replace(check, next_step=before + hint)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -63,22 +63,19 @@ class CommandParser(argparse.ArgumentParser):
         option in the parser that knows the options: argparse would leave it to the outermost parser.
         """
         if self.usual_action and args is not None:
+            from tdhil.cli.arguments import meant
+
             actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
             if not args or args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
-                self._refuse_misspelt(args, actions.choices)
+                word = args[0] if args else "-"
+                # the default action would take a misspelt action as a file
+                if not word.startswith("-") and (hint := meant(word, actions.choices)) and not Path(word).exists():
+                    raise self._refusal(f"there is no action {word[:40]}", MessageCode.USAGE, hint)
                 args = [self.usual_action, *args]
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             raise self._unknown(unknown)
         return found, unknown
-
-    def _refuse_misspelt(self, words: Sequence[str], actions: Iterable[str]) -> None:
-        """Refuse a first word that is no file and resembles an action. The default action would take it as a file."""
-        from tdhil.cli.arguments import meant
-
-        word = words[0] if words else "-"
-        if not word.startswith("-") and (hint := meant(word, actions)) and not Path(word).exists():
-            raise self._refusal(f"there is no action {word[:40]}", MessageCode.USAGE, hint)
 
     def _unknown(self, words: list[str]) -> UsageError:
         from tdhil.cli.arguments import meant

@@ -55,7 +55,13 @@ class LivePicture:
         if len(news.samples):
             self.last_s, self.arrived_s = float(news.samples[-1, 0]), at_s
             self.epoch_ns = self.epoch_ns or news.epoch_ns
-            if len(kept := self._thinned(news.samples)):
+            rows = []
+            for row, time_s in enumerate(news.samples[:, 0].tolist()):
+                if time_s >= self._next_s or time_s < self._next_s - 2.0 * self._spacing_s:
+                    rows.append(row)
+                    self._next_s = time_s + self._spacing_s
+            if rows:
+                kept = news.samples[rows]
                 self.samples = np.concatenate((self.samples, kept))
                 shown["samples"] = columns(kept)
                 if len(self.samples) > MOST:
@@ -91,14 +97,6 @@ class LivePicture:
         if self.stepped or not self.epoch_ns:
             return max(0.0, mono_s - self.arrived_s)
         return max(0.0, wall_s - (self.epoch_ns / 1e9 + self.last_s))
-
-    def _thinned(self, samples: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        kept = []
-        for row, time_s in enumerate(samples[:, 0].tolist()):
-            if time_s >= self._next_s or time_s < self._next_s - 2.0 * self._spacing_s:
-                kept.append(row)
-                self._next_s = time_s + self._spacing_s
-        return samples[kept]
 
 
 def columns(samples: np.ndarray[Any, Any]) -> list[list[float | None]]:
