@@ -238,9 +238,10 @@ def _profile(options: RunOptions, connection: Connection) -> Iterator[DoctorFind
 
 
 def _limits(rig: Rig | None) -> Iterator[DoctorFinding]:
+    from tdhil.config import limits_step
+
     if rig is not None and rig.limits is not None:
         limits = rig.limits
         yield ok("limits", f"{limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m ({rig.source('limits')})")
     else:
-        step = "Add a section limits: to rig.yaml, and name the file with --rig"
-        yield note("limits", "none: a real drive will not be moved", step)
+        yield note("limits", "none: a real drive will not be moved", limits_step(rig))

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     )
     from tdhil.config.rig import (
         LONGEST_NAME as LONGEST_NAME, DriveData as DriveData, Limits as Limits, Registered as Registered, Rig as Rig,
-        load_rig as load_rig, parse_rig as parse_rig,
+        limits_step as limits_step, load_rig as load_rig, parse_rig as parse_rig,
         require_limits as require_limits, require_name as require_name,
         rig_model as rig_model, simulated_default_rig as simulated_default_rig,
     )
@@ -44,6 +44,6 @@ else:
                     "has_plateaus imported load identified_before_echo",
         "acceptance": "ACCEPTED_QUANTITIES Expectation expectations_in expectations_of",
         "resolution": "check_values resolve wrong_values",
-        "rig": "LONGEST_NAME DriveData Limits Registered Rig load_rig parse_rig require_limits require_name rig_model "
-               "simulated_default_rig",
+        "rig": "LONGEST_NAME DriveData Limits Registered Rig limits_step load_rig parse_rig require_limits "
+               "require_name rig_model simulated_default_rig",
     })

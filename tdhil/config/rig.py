@@ -394,12 +394,17 @@ def require_limits(rig: Rig | None) -> Limits:
     """Return the limits. Raises PreflightRefused with the missing keys: no real shaft moves without limits."""
     if rig is not None and rig.limits is not None:
         return rig.limits
+    where = rig._file if rig is not None and rig._file else "rig.yaml"
+    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where,
+                           next_step=limits_step(rig), entry=MessageCode.NO_LIMITS)
+
+
+def limits_step(rig: Rig | None) -> str:
+    """Return the step that adds the missing limits."""
     keys = ", ".join(name for name, field in Limits.model_fields.items() if field.is_required())
-    file = rig._file if rig is not None and rig._file else ""
-    where = file or "rig.yaml"
-    step = f"Add a section limits: with {keys} (docs: rig.yaml)" + ("" if file else ", and name the file with --rig")
-    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where, next_step=step,
-                           entry=MessageCode.NO_LIMITS)
+    if rig is not None and rig._file:
+        return f"Add a section limits: with {keys} (docs: rig.yaml)"
+    return f"Add a section limits: with {keys} (docs: rig.yaml), and name the file with --rig"
 
 
 def require_name(rig: Rig | None) -> str:
