@@ -225,11 +225,12 @@ def test_numbers_of_a_script_have_the_sign_of_the_language_and_send_a_point():
     if shutil.which("node") is None:
         pytest.skip("no node: tests/service/chromium/test_german.py shows the same in Chromium")
     calls = [["fixed", 1234.5, 2], ["precise", 0.00001234, 2], ["local", "-1.5e-7"], ["tick", 1234.5],
-             ["point", "0,5"], ["point", " -2,5 kN·m"], ["point", "1.5"], ["point", "1.000,5"], ["point", "eth1,2"]]
+             ["point", "0,5"], ["point", " -2,5 kN·m"], ["point", "1.5"], ["point", "1.000,5"], ["point", "eth1,2"],
+             ["fixed", -0.00004, 3]]
     assert in_script("en", *calls) == ["1234.50", "0.000012", "-1.5e-7", "1234.5",
-                                       "0.5", "-2.5 kN·m", "1.5", "1.000,5", "eth1,2"]
+                                       "0.5", "-2.5 kN·m", "1.5", "1.000,5", "eth1,2", "0.000"]
     assert in_script("de", *calls) == ["1234,50", "0,000012", "-1,5e-7", "1234,5",
-                                       "0.5", "-2.5 kN·m", "1.5", "1.000,5", "eth1,2"]
+                                       "0.5", "-2.5 kN·m", "1.5", "1.000,5", "eth1,2", "0,000"]
     error = {"what": "operator does not have the role admin", "where": "audit", "message": "x", "code": "TDH-413",
              "next_step": "Ask an engineer"}
     unknown = {"what": "7 moles", "where": "", "message": "7 moles", "code": "TDH-412", "next_step": ""}

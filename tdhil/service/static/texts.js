@@ -68,7 +68,7 @@
   const POINT = new Intl.NumberFormat(LANGUAGE).formatToParts(1.5).find((one) => one.type === "decimal").value;
   /** A formatted number with the decimal sign of the language. Thousands are never grouped: 1.000 would be read as 1. */
   const local = (text) => (POINT === "." ? text : text.replace(/(\d)\.(?=\d)/g, `$1${POINT}`));
-  const fixed = (value, places) => local(value.toFixed(places));
+  const fixed = (value, places) => local((Number(value.toFixed(places)) + 0).toFixed(places));      // + 0: no −0
   const precise = (value, digits) => local(value.toPrecision(digits));
   const ticks = new Intl.NumberFormat(LANGUAGE, { useGrouping: false, maximumSignificantDigits: 8 });
   const tick = (value) => (value === null ? "" : ticks.format(value));
