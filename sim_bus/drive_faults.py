@@ -232,38 +232,42 @@ def of_bus(
         return FaultKind(row, summary, lambda v: transfers(how, *object_place(v)), usual, "OBJECT")
 
     return {
-        "bus-dead": FaultKind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(dead)),
-        "frame-loss": FaultKind(17, "this share of all frames is lost, either way", lambda v: lossy(share(v)), loss,
-                                "SHARE"),
+        "bus-dead": FaultKind(12, "no frame is transmitted any more, as with a cut cable", plain(dead)),
+        "frame-loss": FaultKind(17, "this share of all frames is lost, in both directions",
+                                lambda v: lossy(share(v)), loss, "SHARE"),
         "node-reset": FaultKind(21, f"the drive restarts ({restarts}); its torque is off, the shaft coasts",
                                 plain(restart)),
-        "sdo-abort": transfer(24, "the drive aborts every transfer of an object", Meddling.ABORTED, "6072h"),
-        "sdo-timeout": transfer(25, "the drive doesn't answer when asked for an object", Meddling.UNANSWERED, "6072h"),
-        "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
+        "sdo-abort": transfer(24, "the drive aborts each SDO transfer of an object", Meddling.ABORTED, "6072h"),
+        "sdo-timeout": transfer(25, "the drive does not answer SDO requests for an object", Meddling.UNANSWERED,
+                                "6072h"),
+        "wrong-identity": FaultKind(29, "the vendor ID, 1018h:1, is another one",
                                     plain(lambda: transfers(Meddling.OTHERWISE, 0x1018, 1))),
-        "write-not-kept": transfer(45, "a write to an object is answered and not kept", Meddling.NOT_KEPT, "6080h"),
-        "reads-back-otherwise": transfer(45, "an object reads back as something else", Meddling.OTHERWISE, "6072h"),
+        "write-not-kept": transfer(45, "the drive confirms a write to an object, and keeps the old value",
+                                   Meddling.NOT_KEPT, "6080h"),
+        "reads-back-otherwise": transfer(45, "an object reads back with another value", Meddling.OTHERWISE, "6072h"),
     }
 
 
 def of_drive(act: Callable[[InjectedFault], M]) -> dict[str, FaultKind[M]]:
     """Return the table as faults of one bus. ``act`` converts a fault into one of the bus."""
     return {
-        "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
+        "emcy": FaultKind(23, "the drive sends an emergency message and stays enabled",
                           lambda v: act(Emcy(error_code(v))), "7305h", "CODE"),
-        "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
-                                 lambda v: act(FaultReaction(error_code(v))), "3210h", "CODE"),
-        "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
+        "drive-fault": FaultKind(
+            23, "the drive sends an emergency message, and is in the fault state after its fault reaction",
+            lambda v: act(FaultReaction(error_code(v))), "3210h", "CODE"),
+        "fault-at-start": FaultKind(30, "the drive is in the fault state before the run",
                                     lambda v: act(FaultReaction(error_code(v))), "3210h", "CODE"),
-        "stuck-state": FaultKind(31, "the controlword is ignored", plain(lambda: act(Deaf()))),
-        "mode-not-followed": FaultKind(32, "6061h doesn't follow 6060h", plain(lambda: act(ModeKept()))),
-        "mode-lost": FaultKind(82, "the drive goes over to mode 3 by itself, and stays there",
+        "stuck-state": FaultKind(31, "the drive ignores the controlword", plain(lambda: act(Deaf()))),
+        "mode-not-followed": FaultKind(32, "the mode display 6061h does not follow 6060h",
+                                       plain(lambda: act(ModeKept()))),
+        "mode-lost": FaultKind(82, "the drive changes to mode 3 without a command, and stays there",
                                plain(lambda: act(ModeLost()))),
-        "sto": FaultKind(33, "safe torque off: the shaft coasts, and nothing enables the drive",
+        "sto": FaultKind(33, "safe torque off: the shaft coasts, and the drive cannot be enabled",
                          plain(lambda: act(SafeTorqueOff()))),
-        "internal-limit": FaultKind(33, "an internal limit leaves this share of the torque",
+        "internal-limit": FaultKind(33, "an internal limit reduces the torque to this share",
                                     lambda v: act(LimitedTorque(share(v))), "10%", "SHARE"),
-        "load-lost": FaultKind(34, "the load comes off: this share of inertia and friction is left",
+        "load-lost": FaultKind(34, "the load comes off the shaft: this share of inertia and friction remains",
                                lambda v: act(LoadLost(max(0.001, share(v)))), "10%", "SHARE"),
         **lying(lambda lie: act(Lying(lie))),
     }

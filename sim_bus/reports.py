@@ -437,8 +437,8 @@ _WAYS = (
     _QuantityDistortion("sign", "has the opposite sign", lambda _: Linear(-1.0)),
     _QuantityDistortion("offset", "is larger by this, in {unit}", lambda v: Linear(1.0, _amount(v)), "1",
                         "AMOUNT"),
-    _QuantityDistortion("delay", "comes so much later", lambda v: DelayedValue(seconds(v)), "500ms", "TIME"),
-    _QuantityDistortion("coarse", "has only multiples of this, in {unit}", lambda v: Coarse(_step(v)), "1",
+    _QuantityDistortion("delay", "is later by this time", lambda v: DelayedValue(seconds(v)), "500ms", "TIME"),
+    _QuantityDistortion("coarse", "is rounded to multiples of this, in {unit}", lambda v: Coarse(_step(v)), "1",
                         "STEP"),
 )
 _QUANTITIES = {
@@ -459,7 +459,8 @@ def _of_value(signal: Feedback, words: str, way: _QuantityDistortion) -> ReportF
 
 def _of_sensor(way: _QuantityDistortion) -> ReportFault:
     text = way.text.format(unit=_UNITS[Feedback.SPEED])
-    return ReportFault(f"sensor-{way.name}", f"the drive's own speed sensor {text}; control and position follow it",
+    return ReportFault(f"sensor-{way.name}",
+                       f"the signal of the drive's speed sensor {text}; speed control and position follow it",
                        lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes, 115)
 
 
@@ -480,31 +481,31 @@ _ROWS = (
       for signal, words in _QUANTITIES.items()),
     *(_of_sensor(way) for way in (
         *_WAYS,
-        _QuantityDistortion("slips", "stands still for this share of every second", lambda v: Slipping(share(v)), "30%",
-                     "SHARE"))),
-    _of_words("speed-swapped", "the reported speed shows the torque's count",
+        _QuantityDistortion("slips", "does not change for this share of each second", lambda v: Slipping(share(v)),
+                            "30%", "SHARE"))),
+    _of_words("speed-swapped", "the reported speed is the count of the torque",
               (Feedback.SPEED, lambda: Swapped(Feedback.TORQUE))),
-    _of_words("torque-swapped", "the reported torque shows the speed's count",
+    _of_words("torque-swapped", "the reported torque is the count of the speed",
               (Feedback.TORQUE, lambda: Swapped(Feedback.SPEED))),
-    _of_words("speed-torque-swapped", "reported speed and torque show each other's count",
+    _of_words("speed-torque-swapped", "the counts of reported speed and torque are exchanged",
               (Feedback.SPEED, lambda: Swapped(Feedback.TORQUE)), (Feedback.TORQUE, lambda: Swapped(Feedback.SPEED))),
     _of_words("status-zero", "the statusword is 0000h", (Feedback.STATUS, Zero)),
     _of_words("status-ones", "the statusword is FFFFh", (Feedback.STATUS, Ones)),
-    _of_words("status-frozen", "the statusword stays as it is", (Feedback.STATUS, Kept)),
+    _of_words("status-frozen", "the statusword does not change", (Feedback.STATUS, Kept)),
     _of_words("feedback-zero", "all reports are 0, the statusword too", *((signal, Zero) for signal in _ALL)),
     _of_words("feedback-ones", "all reports have all bits set, the statusword too",
               *((signal, Ones) for signal in _ALL)),
-    ReportFault("feedback-delay", "speed, torque, demand and position come so much later",
+    ReportFault("feedback-delay", "speed, torque, demand and position are later by this time",
                 lambda v: OfValues(tuple(_QUANTITIES), lambda: DelayedValue(seconds(v))), "500ms", "TIME"),
     ReportFault("encoder-inverted", "the reported speed has the wrong sign",
                 lambda _: OfValues((Feedback.SPEED,), lambda: Linear(-1.0)), row=36),
-    _of_stage("torque-constant", "the true torque is this times what the drive reports and demands",
+    _of_stage("torque-constant", "the true torque is the reported and demanded torque times this factor",
               lambda v: PowerStage(factor=factor(v)), "0.5", "FACTOR"),
-    _of_stage("motor-polarity", "the true torque has the opposite sign of what the drive reports and demands",
+    _of_stage("motor-polarity", "the true torque has the opposite sign of the reported and demanded torque",
               lambda _: PowerStage(factor=-1.0)),
-    _of_stage("quick-stop-inverted", "a quick stop of the drive accelerates; the torque is reported as it is",
+    _of_stage("quick-stop-inverted", "a quick stop accelerates the shaft; the drive reports the true torque",
               lambda _: PowerStage(in_stop=-1.0)),
-    _of_stage("torque-stuck", "the torque stays at this, N·m, while the power stage is on; it is reported as it is",
+    _of_stage("torque-stuck", "the torque stays at this value, N·m, while the power stage is on; the drive reports it",
               lambda v: PowerStage(stuck_nm=_amount(v)), "100", "TORQUE"),
 )
 LIES: dict[str, ReportFault] = {row.name: row for row in _ROWS}

@@ -49,19 +49,20 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     ),
     "frozen-feedback": FaultKind(19, "the inputs keep their last values", plain(
         lambda: changed(_slave, "inputs", lambda line: partial(bytes, line.slave.inputs())))),
-    "watchdog-not-armed": FaultKind(50, "writes to registers 0400h to 0421h are answered and not kept", plain(
+    "watchdog-not-armed": FaultKind(
+        50, "the slave confirms writes to registers 0400h to 0421h, and keeps the old values", plain(
         lambda: changed(lambda line: line.slave.esc, "locked", lambda _: range(0x0400, 0x0422)))),
-    "mailbox-timeout": FaultKind(125, "no message in the mailbox is answered",
+    "mailbox-timeout": FaultKind(125, "the slave answers no message in its mailbox",
                                  plain(lambda: changed(_slave, "mailbox", lambda _: lambda message: None))),
-    "wrong-working-counter": FaultKind(124, "this share of the process data comes back with a working counter of 0",
+    "wrong-working-counter": FaultKind(124, "this share of the process data returns with a working counter of 0",
                                        lambda v: _part("uncounted", share(v)), "1%", "SHARE"),
     "al-error": FaultKind(122, "the slave leaves OPERATIONAL with this AL status code",
                           once(error_code, lambda line, code: line.slave.al_error(code)), "001Bh", "CODE"),
-    "sm-watchdog": FaultKind(123, "the watchdog of the process data expires, though they come",
+    "sm-watchdog": FaultKind(123, "the process data watchdog expires, although data arrive",
                              plain(lambda: Misbehaviour(lambda line: line.slave.esc.expire_watchdog()))),
-    "sii-garbage": FaultKind(126, "the identity in the EEPROM reads as ones, and its checksum is wrong",
+    "sii-garbage": FaultKind(126, "all bits of the identity in the EEPROM are set, and its checksum is wrong",
                              plain(lambda: changed(lambda line: line.slave.esc, "eeprom", _garbage))),
-    "clock-jump": FaultKind(127, "the distributed clock jumps by so many seconds", once(number, _jump), "1", "SECONDS"),
+    "clock-jump": FaultKind(127, "the distributed clock jumps by this time, s", once(number, _jump), "1", "SECONDS"),
     **of_drive(lambda fault: Misbehaviour(lambda line: fault.begin(line.slave), lambda line: fault.end(line.slave))),
 })
 parse_all, listed, listing = KINDS.parse_all, KINDS.listed, KINDS.listing
