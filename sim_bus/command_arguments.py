@@ -5,6 +5,7 @@ error of use.
 import argparse
 import contextlib
 import math
+import shutil
 import signal
 import sys
 import threading
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 EXIT_OK = 0
 EXIT_USAGE = 2
+_UNWRAPPED = 1000         # columns
 
 
 class Unusable(Exception):
@@ -71,15 +73,20 @@ def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
                        help=f"a scripted fault, such as {such_as}; repeatable; 'list' shows them all")
 
 
+def printed_width() -> int:
+    """Return the columns of the terminal on stdout; without one, a width at which no line of a list is wrapped."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _UNWRAPPED
+
+
 def until_stopped(
-    namespace: argparse.Namespace, listing: Callable[[], str], simulate: Callable[[threading.Event], None]
+    namespace: argparse.Namespace, listing: Callable[[int], str], simulate: Callable[[threading.Event], None]
 ) -> int:
     """Run ``simulate`` until SIGINT or SIGTERM. Return the exit code. An error of use ends with one line.
 
     For ``--fault list``, print the ``listing`` of the faults instead.
     """
     if "list" in namespace.fault:
-        print(listing())  # noqa: T201
+        print(listing(printed_width()))  # noqa: T201
         return EXIT_OK
     stop = threading.Event()
     try:

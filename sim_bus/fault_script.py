@@ -12,7 +12,9 @@
 import re
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import inf
+from textwrap import fill
 from typing import Generic, TypeVar
 
 from profiles import STAGE_NUMBERS, MessageCode, TdhilError
@@ -292,13 +294,14 @@ class Kinds(dict[str, FaultKind[M]]):
             for name, kind in sorted(self.items(), key=lambda item: (item[1].row or 99, item[0]))
         )
 
-    def listing(self) -> str:
-        """Return the list of faults with row and value as a text."""
+    def listing(self, width: int) -> str:
+        """Return the list of faults with row and value as a text, wrapped at ``width`` columns."""
+        wrap = partial(fill, width=width, break_long_words=False, break_on_hyphens=False)
         lines = [
-            f"NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: {', '.join(_MOMENTS)}, hold+2s",
+            wrap(f"NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: {', '.join(_MOMENTS)}, hold+2s"),
             "", f"{'row':>3}  {'name':<37}what happens",
         ]
         for one in self.listed():
             shown = f"{one.name}[={one.value}]" if one.takes else one.name
-            lines.append(f"{one.row or '-':>3}  {shown:<37}{one.summary}")
+            lines.append(wrap(f"{one.row or '-':>3}  {shown:<37}{one.summary}", subsequent_indent=" " * 42))
         return "\n".join(lines)

@@ -241,8 +241,8 @@ class Bus:
     """Return the faults that ``--fault`` requests. Raises UsageError."""
     faults: Callable[[], tuple[KnownFault, ...]]
     """Return the faults that ``--fault`` accepts."""
-    fault_listing: Callable[[], str]
-    """Return the text that ``--fault list`` prints."""
+    fault_listing: Callable[[int], str]
+    """Return the text that ``--fault list`` prints, wrapped at this many columns."""
 
     # Scan and doctor. Neither writes to a drive.
     scan: Callable[[PeerPlan, Connection, RunOptions, argparse.Namespace], tuple[tuple[FoundDrive, ...], list[str]]]

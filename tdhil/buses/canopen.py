@@ -501,10 +501,10 @@ def _faults() -> tuple[KnownFault, ...]:
     return listed()
 
 
-def _fault_listing() -> str:
+def _fault_listing(width: int) -> str:
     from sim_bus.canopen import listing
 
-    return listing()
+    return listing(width)
 
 
 def _bit_rate(text: str) -> int:

@@ -296,10 +296,10 @@ def _faults() -> tuple[KnownFault, ...]:
     return listed()
 
 
-def _fault_listing() -> str:
+def _fault_listing(width: int) -> str:
     from sim_bus.ethercat import listing
 
-    return listing()
+    return listing(width)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -234,10 +234,10 @@ def _faults() -> tuple[KnownFault, ...]:
     return listed("embedded")
 
 
-def _fault_listing() -> str:
+def _fault_listing(width: int) -> str:
     from sim_bus.modbus import listing
 
-    return listing()
+    return listing(width)
 
 
 def profile_of(connection: Connection) -> ModbusProfile:

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 def list_faults(drive: str | None) -> int:
     """Print the known faults of one bus, or of all of them. Return the exit code."""
-    shown = [bus for bus in all_buses() if drive in (None, bus.name)]
-    print("\n\n".join(f"--drive {bus.name}\n\n{bus.fault_listing()}" for bus in shown))  # noqa: T201
+    from sim_bus import printed_width
+
+    shown, width = [bus for bus in all_buses() if drive in (None, bus.name)], printed_width()
+    print("\n\n".join(f"--drive {bus.name}\n\n{bus.fault_listing(width)}" for bus in shown))  # noqa: T201
     return 0
 
 

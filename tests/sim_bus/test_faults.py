@@ -103,6 +103,13 @@ def test_the_list(kind, capsys):
     assert main([kind, "--fault", "list"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in KINDS)
+    assert len(out.splitlines()) == len(KINDS) + 3      # outside a terminal each fault has one line
+
+
+def test_the_list_is_wrapped_at_the_width_of_the_terminal():
+    found = KINDS.listing(80)
+    assert max(map(len, found.splitlines())) <= 80
+    assert " ".join(found.split()) == " ".join(KINDS.listing(1000).split())
 
 
 def test_a_fault_that_there_is_not_is_one_line(capsys):

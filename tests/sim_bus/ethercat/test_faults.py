@@ -27,7 +27,7 @@ def test_the_list_names_every_fault_and_each_can_be_made():
     names = {one.name for one in listed()}
     assert {"frame-loss", "wrong-working-counter", "al-error", "sm-watchdog", "sii-garbage", "mailbox-timeout",
             "clock-jump", "sto", "stuck-state"} <= names
-    assert all(one.name in listing() for one in listed())
+    assert all(one.name in listing(80) for one in listed())
     parse_all([one.name for one in listed()])
     for wrong in ("frame-loss=2", "al-error=xyz", "sdo-abort=12", "nothing", "sii-garbage=1"):
         with pytest.raises(FaultRefused):
