@@ -74,7 +74,7 @@ def verification_document(
         "next_step": _AFTER_ABORT if ended_early else _NEXT[found.outcome.value],
         "confidence": found.confidence,
         "rows": [{"name": row.name, "measured": asdict(row.measured), "predicted": asdict(row.predicted),
-                  "within": row.within} for row in found.rows],
+                  "within": row.within if found.explained else None} for row in found.rows],
         "tuned_for": {"kind": case.kind, "source": case.source},
         "steps": asdict(program) | {"step_rad_s": program.step_rad_s, "counted_pairs": found.pairs},
         "misfit": {"rms_share": found.misfit_rms, "p": found.misfit_p},
@@ -124,11 +124,11 @@ def _rows(document: Part) -> Iterator[tuple[str, str]]:
 
 
 def _table(document: Part) -> Iterator[tuple[str, str, str, str]]:
-    """Yield name, measured, predicted, and whether both meet."""
+    """Yield name, measured, predicted, and whether both meet; nothing if no gains explain the response."""
     for row in document["rows"]:
         name, times = _NAMES[row["name"]]
         yield (name, table_cell(row["measured"], times), table_cell(row["predicted"], times),
-               "agrees" if row["within"] else "differs")
+               "" if row["within"] is None else "agrees" if row["within"] else "differs")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -106,6 +106,8 @@ class StepVerification:
     """Number of pairs after which P and I would be known well enough, if the number of pairs alone was too small."""
     confidence: float = CONFIDENCE
     """Joint coverage of the measured intervals."""
+    explained: bool = True
+    """False: no P and I on this shaft explain the response, and the rows compare nothing."""
 
 
 @dataclass(frozen=True)
@@ -198,12 +200,14 @@ def verify_steps(
     rows = _rows(model, _possible(theta, covariance, cost, birge), covariance, number)
     amplitude = abs(model.rounding_amplitude(theta)) if model.counts < FEW_COUNTS else 0.0
     alike = amplitude > (ROUNDED_AMPLITUDE if chance < UNLIKE_P else QUIET_AMPLITUDE)
-    outcome, reason = _judged(rows, rms, chance, limited=limited, rounded_alike=alike)
+    explained = rms <= UNLIKE_RMS or chance >= UNLIKE_P
+    outcome, reason = _judged(rows, rms, explained=explained, limited=limited, rounded_alike=alike)
     needed = None
     if outcome is StepOutcome.CANNOT_TELL and not (limited or alike):
         widest = max(0.5 * log(row.measured.high / row.measured.low) for row in rows[3:])
         needed = ceil(number * max(LEAST_LONGER, (widest / WELL_KNOWN) ** 2))
-    return StepVerification(outcome, reason, rows, number, rms, chance, time_s, mean, fitted, expected, needed)
+    return StepVerification(outcome, reason, rows, number, rms, chance, time_s, mean, fitted, expected, needed,
+                            explained=explained)
 
 
 def _whitening(scatter: Reals) -> Callable[[Reals], Reals]:
@@ -306,15 +310,11 @@ def _rows(model: StepModel, draws: Sequence[Reals], covariance: Reals, number: i
     figures = _figures(model, draws)
     rows = []
     for k, name in enumerate(names[:3]):
-        values = figures[:, k]
-        predicted: Range = getattr(case, name)
-        if not np.all(np.isfinite(values)):
-            rows.append(StepRow(name, Range(float(values[0]), float(np.min(values)), inf), predicted))
-            continue
-        share = 0.5 * (1.0 - CONFIDENCE) / len(names)
-        low, high = np.quantile(values, (share, 1.0 - share))
-        rows.append(StepRow(name, Range(float(values[0]), min(float(low), float(values[0])),
-                                        max(float(high), float(values[0]))), predicted))
+        values, share = figures[:, k], 0.5 * (1.0 - CONFIDENCE) / len(names)
+        finite = bool(np.all(np.isfinite(values)))
+        low, high = np.quantile(values, (share, 1.0 - share)) if finite else (np.min(values), inf)
+        value = float(values[0])
+        rows.append(StepRow(name, Range(value, min(float(low), value), max(float(high), value)), getattr(case, name)))
     return (*rows, *gains)
 
 
@@ -332,7 +332,7 @@ _WORDS = {"overshoot_share": "overshoot", "rise_s": "rise time", "settling_s": "
 
 
 def _judged(
-    rows: tuple[StepRow, ...], rms: float, chance: float, *, limited: bool, rounded_alike: bool
+    rows: tuple[StepRow, ...], rms: float, *, explained: bool, limited: bool, rounded_alike: bool
 ) -> tuple[StepOutcome, str]:
     """Return the verdict from the intervals, and its reason."""
     if limited:
@@ -340,7 +340,7 @@ def _judged(
     if rounded_alike:
         return StepOutcome.CANNOT_TELL, (
             "a step is a few counts of the reported speed, and all steps are rounded alike: no noise averages this out")
-    if rms > UNLIKE_RMS and chance < UNLIKE_P:
+    if not explained:
         return StepOutcome.DIFFERS, (
             f"the response differs from that of any P and I on this shaft by {100 * rms:.1f} % of the step (rms): a "
             "ramp, a filter or another resonance acts")
