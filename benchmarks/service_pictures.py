@@ -31,7 +31,10 @@ from tests.service.test_serve import served
 DOCS = Path(__file__).parents[1] / "docs" / "images"
 RIG, SEED = "simulated-canopen", 7
 LIVE_PX, RESULT_PX = 760, 1180
-ALL_PICTURES = "Promise.all([...document.images].map((one) => { one.loading = 'eager'; return one.decode(); }))"
+ALL_PICTURES = """Promise.all([...document.images].filter((one) => one.src).map((one) => {
+  one.loading = 'eager';
+  return one.decode();
+}))"""
 MOVING = "() => document.getElementById('state').textContent.includes('acquire')"
 
 
@@ -65,6 +68,7 @@ def every_page(chromium: Any, server: Any, folder: Path) -> None:
         save(page, folder / f"live-{name}.png")
     server.client.wait(run, timeout_s=600.0)
     for name, page in contexts.items():
+        page.wait_for_url(f"**/runs/{run}")            # the live page of a run that has ended becomes its result
         for title, path in PAGES.items():
             page.goto(path.format(run=run))
             page.wait_for_timeout(1500)                # pages ask again and again: the network is never idle
