@@ -14,7 +14,7 @@ from rich.text import Text as Words
 from tdhil.report.document import SIMULATED
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
-from tdhil.report.plots import CAPTION_SIGNS, DARK, OURS, PAPER, PNG_DPI, QUIET
+from tdhil.report.plots import CAPTION_SIGNS, DARK, OURS, PAPER, PNG_DPI, QUIET, level_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,6 +151,7 @@ def _finish(every: Sequence[Axes]) -> None:
     for axes in every:
         axes.set_xscale("log")
         axes.grid(alpha=0.3, which="both")
+        level_ticks(axes.xaxis)
         for which in ("major", "minor"):
             getattr(axes.xaxis, f"set_{which}_formatter")(_plain_number)
     every[-1].set_xlabel("frequency, Hz")

@@ -86,8 +86,15 @@ OURS, PAPER, DARK, QUIET = "#1f5fa8", "#c2410c", "0.15", "0.55"
 Part = Mapping[str, Any]
 
 
+def level_ticks(axis: Axis) -> None:
+    """Give major and minor ticks one length, so that their labels stand on one line."""
+    axis.set_tick_params(which="both", length=3.0, pad=3.5)
+
+
 def plain_ticks(axis: Axis) -> None:
     """Label a logarithmic axis with 0.1, 0.2, 0.5 instead of powers of ten."""
+    level_ticks(axis)
+
     def text(value: float, _: object = None) -> str:
         return f"{value:g}" if f"{value:.0e}"[0] in "125" else ""
 
