@@ -81,7 +81,14 @@ def test_documents_differ_in_values_and_not_in_dates_or_versions():
     before = {"date": "1", "tdhil": "0.1.0", "inertia_kg_m2": {"low": 1.0, "high": 2.0},
               "rows": [{"a": 1}, {"a": 2}]}
     same = before | {"date": "2", "tdhil": "0.2.0"}
-    assert list(same_documents.differing(before, same)) == []
+    assert list(same_documents.differing(before, same, {}, 0.0)) == []
     other = before | {"inertia_kg_m2": {"low": 1.0, "high": 2.5, "unit": "kg"}, "rows": [{"a": 1}]}
-    assert list(same_documents.differing(before, other)) == [
+    assert list(same_documents.differing(before, other, {}, 0.0)) == [
         "inertia_kg_m2.high: 2.0, 2.5", "inertia_kg_m2.unit: absent, kg", "rows: 2 items, 1"]
+
+
+def test_numbers_within_a_share_do_not_differ_and_the_share_is_kept():
+    near: dict[str, float] = {}
+    before, after = {"low": 1.0, "high": 2.0, "count": 3}, {"low": 1.0 + 1e-9, "high": 2.1, "count": 4}
+    assert list(same_documents.differing(before, after, near, 1e-6)) == ["count: 3, 4", "high: 2.0, 2.1"]
+    assert near == {"low": pytest.approx(1e-9)}
