@@ -73,8 +73,9 @@ def settle(table: PreflightTable, tried: PreflightTable, accepted: bool, is_off:
         last, hint = refused[-1], _NOT_OFF if accepted else _HINT
         before = last.next_step and last.next_step + ("" if last.next_step.endswith((".", "?", "!")) else ".") + " "
         hinted = replace(last, next_step=before + hint)
-        tried.checks = [hinted if check is last else check for check in tried.checks]
-    table.checks += tried.checks
+        table.checks += [hinted if check is last else check for check in tried.checks]
+    else:
+        table.checks += tried.checks
     return not refused
 
 

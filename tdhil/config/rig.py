@@ -402,9 +402,8 @@ def require_limits(rig: Rig | None) -> Limits:
 def limits_step(rig: Rig | None) -> str:
     """Return the step that adds the missing limits."""
     keys = ", ".join(name for name, field in Limits.model_fields.items() if field.is_required())
-    if rig is not None and rig._file:
-        return f"Add a section limits: with {keys} (docs: rig.yaml)"
-    return f"Add a section limits: with {keys} (docs: rig.yaml), and name the file with --rig"
+    named = rig is not None and rig._file
+    return f"Add a section limits: with {keys} (docs: rig.yaml)" + ("" if named else ", and name the file with --rig")
 
 
 def require_name(rig: Rig | None) -> str:
