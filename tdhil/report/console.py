@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TextIO
 
@@ -67,12 +67,21 @@ def figures_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: 
     return grid
 
 
-def print_settings(settings: Iterable[tuple[str, str, str]], console: Console) -> None:
-    """Print parameters of the drive with the value to enter and its confidence."""
-    console.print(Text("to be typed into the drive, by hand (confidence of the profile's entry)", style="bold"))
-    grid = Table.grid(padding=(0, 2))
-    for _ in range(2):
-        grid.add_column(overflow="fold")
-    for title, value, sure in settings:
-        grid.add_row(title, f"{value} ({sure})")
-    console.print(grid)
+# The shaft may turn between the two entries. With a rigid shaft a smaller I raises the loop's phase at every frequency
+# and lowers its gain, so that the phase margin does not fall. If I falls, it comes first: the loop in between is the
+# present one with a smaller I. If I rises, P comes first: the loop in between is the new one with a smaller I.
+ENTRY_ORDER = ("If I becomes smaller, type it in first; otherwise type in P first. In the other order the loop may "
+               "oscillate between the two entries.")
+
+
+def print_settings(settings: Sequence[tuple[str, str, str]], console: Console) -> None:
+    """Print parameters of the drive with the value to enter and its confidence, if any, and the order of P and I."""
+    if settings:
+        console.print(Text("to be typed into the drive, by hand (confidence of the profile's entry)", style="bold"))
+        grid = Table.grid(padding=(0, 2))
+        for _ in range(2):
+            grid.add_column(overflow="fold")
+        for title, value, sure in settings:
+            grid.add_row(title, f"{value} ({sure})")
+        console.print(grid)
+    console.print(Text(ENTRY_ORDER))

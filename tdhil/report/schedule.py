@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text as Words
 
 from tdhil.report.blocks import Column, Picture, ReportSection, Table, Text
-from tdhil.report.console import PlainConsole, figures_table
+from tdhil.report.console import ENTRY_ORDER, PlainConsole, figures_table
 from tdhil.report.plots import plain_ticks
 from tdhil.soft_torque import (
     HIGHEST_NOISY_RPM,
@@ -52,13 +52,15 @@ def setting_words(setting: Part) -> str:
     return str(setting["why"]) if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
 
 
-def settings_section(settings: Iterable[tuple[str, str, str]]) -> ReportSection:
-    """Return the drive's parameters with values, and the confidence of their entries in the profile."""
+def settings_section(settings: Sequence[tuple[str, str, str]]) -> ReportSection:
+    """Return the drive's parameters with values and the confidence of their entries, if any; the order of P and I."""
+    how = ("tdhil wrote nothing to the drive. Change one value at a time, at a low speed, with the hard-wired "
+           f"emergency stop within reach. {ENTRY_ORDER}")
+    if not settings:
+        return ReportSection("To be typed into the drive, by hand", (Text(how),))
     return ReportSection("To be typed into the drive, by hand", (
         Table((Column("parameter", 0.4), Column("value", 0.45), Column("confidence", 0.15)), tuple(settings)),
-        Text("tdhil wrote nothing to the drive. Change one value at a time, at a low speed, with the hard-wired "
-             "emergency stop within reach. The confidence is that of the profile's entry "
-             "(docs/reference/profiles.md)."),
+        Text(f"{how} The confidence is that of the profile's entry (docs/reference/profiles.md)."),
     ))
 
 

@@ -249,10 +249,8 @@ def print_loop_tuning(document: Part, console: PlainConsole) -> None:
     console.print(figures_table(("at the motor shaft", *(one["kind"] for one in document["controllers"])),
                                 ((name, *cells) for name, cells in _rows(document))))
     console.print(names_and_texts(_EXPLAINED.items(), quiet=True))
-    settings = list(_setting_rows(document))
-    if settings:
-        console.print()
-        print_settings(settings, console)
+    console.print()
+    print_settings(list(_setting_rows(document)), console)
     if document["notch_by_hand"] is not None:
         console.print()
         console.print(Words(document["notch_by_hand"]))
@@ -429,9 +427,7 @@ def loop_report(document: Part) -> Report:
                     "Speed of the motor after a small step, without torque limit, ramp or setpoint filter."),
         )),
     ]
-    settings = list(_setting_rows(document))
-    if settings:
-        sections.append(settings_section(settings))
+    sections.append(settings_section(list(_setting_rows(document))))
     if document["notch_by_hand"] is not None:
         sections.append(ReportSection("Notch filter, to be set by hand", (Text(document["notch_by_hand"]),)))
     tuned_for = document["tuned_for"]

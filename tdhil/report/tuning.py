@@ -332,10 +332,8 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     for one in document["controllers"]:
         if one["refused"]:
             console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))
-    settings = list(_setting_rows(document))
-    if settings:
-        print_settings(settings, console)
-        console.print()
+    print_settings(list(_setting_rows(document)), console)
+    console.print()
     for warning in document["warnings"]:
         console.print(Words(warning, style="yellow"))
 
@@ -523,9 +521,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         )))
     if document.get("map"):
         sections.append(map_section(document["map"], document["string"]["bit"]["words"]))
-    settings = list(_setting_rows(document))
-    if settings:
-        sections.append(settings_section(settings))
+    sections.append(settings_section(list(_setting_rows(document))))
     if document.get("schedule"):
         sections.append(schedule_section(document["schedule"]))
     of_page = [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]

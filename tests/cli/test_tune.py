@@ -296,6 +296,7 @@ def test_stated_lags_go_before_measured_ones(tuned, measured):
     ({"impedance": impedance(verdict="model_rejected", reason="a reference filter")}, 11, "a reference filter"),
     ({"impedance": impedance(gain_nm_s_rad=None)}, ExitCode.USAGE, "not a number"),
     ({"gear_ratio": 4.0}, ExitCode.USAGE, "gear ratio"),
+    ({"simulated": False}, ExitCode.USAGE, "is of a real drive, and the result is of a simulated one"),
 ])
 def test_what_is_no_measured_impedance_of_this_shaft_is_refused(tuned, measured, said, code, words):
     found, _, err = tuned(*measured(**said), as_json=False)
