@@ -241,7 +241,8 @@ def exit_codes() -> str:
             [
                 "# Exit codes",
                 "",
-                "The exit code of the process says how a command ended. The JSON document has it as `exit_code`.",
+                "The exit code of the process states how a command ended. With `--json`, the document of an error has "
+                "it as `exit_code`.",
                 "",
                 "| exit | meaning | what to do |",
                 "|---|---|---|",

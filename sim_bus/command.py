@@ -6,7 +6,7 @@ from collections.abc import Sequence
 _KINDS = {
     "canopen": "a CiA 402 drive on a CAN bus",
     "ethercat": "a CiA 402 drive on EtherCAT (CoE)",
-    "modbus": "a drive on Modbus TCP or RTU, which wears a profile",
+    "modbus": "a drive on Modbus TCP or RTU, described by a profile",
 }
 
 
@@ -16,7 +16,7 @@ def add_kinds(parser: argparse.ArgumentParser) -> None:
 
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
     for name, module in (("canopen", canopen), ("ethercat", ethercat), ("modbus", modbus)):
-        kind = kinds.add_parser(name, help=_KINDS[name], description=f"Simulates {_KINDS[name]}.")
+        kind = kinds.add_parser(name, help=_KINDS[name], description=f"Simulate {_KINDS[name]}.")
         module.add_arguments(kind)
         kind.set_defaults(run=module.run)
 

@@ -31,7 +31,7 @@ class Unusable(Exception):
 def add_drive_arguments(group: argparse._ArgumentGroup, fault: str, stepped: str) -> None:
     """Add the options of a CiA 402 drive with its shaft. ``fault``: an example of a fault; ``stepped``: help."""
     group.add_argument("--profile", metavar="NAME",
-                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
+                       help="profile of the simulated drive: a name, or a .yaml file (default: tdhil's own EDS)")
     add_rig_arguments(group)
     add_fault_argument(group, fault)
     group.add_argument("--stepped", action="store_true", help=stepped)
@@ -41,15 +41,15 @@ def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
     """Add the options of the shaft and of its trace."""
     group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")
     group.add_argument("--gains", metavar=("P", "I"), nargs=2, type=_gain,
-                       help="of its speed loop, N·m·s/rad and N·m/rad at the motor, over those of --plant")
+                       help="gains of its speed loop, N·m·s/rad and N·m/rad at the motor; replace those of --plant")
     group.add_argument("--torque-scale", metavar="RATIO", type=_scale,
-                       help="torque in the drive's own unit over true torque, over that of --plant")
+                       help="torque in the drive's own unit over true torque; replaces that of --plant")
     group.add_argument("--speed-scale", metavar="RATIO", type=_scale,
-                       help="speed in the drive's own unit over true speed, over that of --plant")
+                       help="speed in the drive's own unit over true speed; replaces that of --plant")
     group.add_argument("--added-inertia", metavar="J", type=_gain,
-                       help="body of known inertia on the motor's shaft, kg·m², over that of --plant")
+                       help="body of known inertia on the motor's shaft, kg·m²; replaces that of --plant")
     group.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of all noise (default 0)")
-    group.add_argument("--trace", metavar="FILE", type=Path, help="write what the true shaft does to this CSV file")
+    group.add_argument("--trace", metavar="FILE", type=Path, help="CSV file for the true motion of the shaft")
 
 
 def rig_of(namespace: argparse.Namespace) -> "RigParams":

@@ -29,10 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bus_arguments(parser)
     group = parser.add_argument_group("simulated drive")
     group.add_argument("--hub", metavar="HOST:PORT", type=host_and_port,
-                       help="open a socketcand hub there and be on it; port 0 takes any free one")
+                       help="open a socketcand hub at this address and connect the drive to it; port 0: any free port")
     group.add_argument("--node", metavar="N", type=number_from(1, 127, "a node ID"), default=1,
                        help="node ID, 1 to 127 (default 1)")
-    add_drive_arguments(group, "heartbeat-lost@hold+2s", "plant time moves with SYNC, by the period of 1006h")
+    add_drive_arguments(group, "heartbeat-lost@hold+2s", "each SYNC advances the rig by the period in 1006h")
 
 
 def run(namespace: argparse.Namespace) -> int:

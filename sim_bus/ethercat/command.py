@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--alias", metavar="N", type=number_from(0, 65535, "an alias"), default=0,
                        help="configured station alias, 0 to 65535 (default 0)")
     add_drive_arguments(group, "frame-loss@hold+2s=1%%",
-                        "plant time moves with the process data, by the period of 5FFEh:3")
+                        "each exchange of process data advances the rig by the period in 5FFEh:3")
 
 
 def run(namespace: argparse.Namespace) -> int:

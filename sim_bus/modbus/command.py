@@ -23,18 +23,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(complain=parser.error)
     group = parser.add_argument_group("simulated drive")
     group.add_argument("--profile", metavar="NAME", default=DEFAULT_PROFILE,
-                       help=f"the drive to be: a profile that ships, or a YAML file (default {DEFAULT_PROFILE})")
+                       help=f"profile of the simulated drive: a name, or a .yaml file (default {DEFAULT_PROFILE})")
     line = group.add_mutually_exclusive_group()
     line.add_argument("--tcp", metavar="HOST:PORT", type=host_and_port,
-                      help="listen there; port 0 takes any free one, without a host only this machine reaches it")
+                      help="listen at this address; port 0: any free port; without a host: this computer only")
     line.add_argument("--rtu", metavar="DEVICE", nargs="?", const="",
                       help="listen on a serial device; without one on a pseudo terminal, named on the ready line")
     group.add_argument("--unit", metavar="N", type=number_from(1, 247, "a unit"),
                        help="unit, 1 to 247 (default: the profile's)")
     add_rig_arguments(group)
     group.add_argument("--wrong", metavar="NAME", action="append", default=[],
-                       help="be wired otherwise than the profile says: word_order, scale_10, address_off_by_one, sign, "
-                       "unsigned, write_not_applied, reads_back_something_else:PARAMETER; may be given again")
+                       help="make the drive deviate from its profile: word_order, scale_10, address_off_by_one, sign, "
+                       "unsigned, write_not_applied, reads_back_something_else:PARAMETER; repeatable")
     add_fault_argument(group, "no-reply@hold+2s")
 
 

@@ -105,12 +105,12 @@ def hide_rare(*actions: argparse.Action) -> None:
     _RARE.update(actions)
 
 
-def add_left_out(parser: argparse._ActionsContainer) -> None:
-    """Add the options that include runs which are left out by default."""
+def add_left_out(parser: argparse._ActionsContainer, by_default: str) -> None:
+    """Add the options that include archived runs and rehearsals; ``by_default``: what happens to these otherwise."""
     parser.add_argument("--archived", action="store_true",
-                        help="include runs that tdhil serve has archived (default: they are left out)")
+                        help=f"include runs that tdhil serve has archived (default: they are {by_default})")
     parser.add_argument("--rehearsals", action="store_true",
-                        help="include rehearsals: runs with --fault (default: they are left out)")
+                        help=f"include rehearsals: runs with --fault (default: they are {by_default})")
 
 
 def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:
@@ -154,10 +154,13 @@ def require_target(flag: str, path: Path, sources: Iterable[Path], source: str) 
                          entry=MessageCode.FILE_NOT_WRITABLE)
 
 
-def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """Add the options that select the drive. Return the group, to which a command may add more."""
+def add_drive_arguments(parser: argparse.ArgumentParser, *, moves: bool = False) -> argparse._ArgumentGroup:
+    """Add the options that select the drive. Return the group, to which a command may add more. ``moves``: the command
+    turns the shaft, which needs a file with the limits.
+    """
     drive = add_options(parser, Topic.DRIVE)[Topic.DRIVE]
-    drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="file of the rig; required to move a real drive")
+    use = "required to move a real drive" if moves else "it states the address of the drive"
+    drive.add_argument("--rig", type=Path, metavar="rig.yaml", help=f"file of the rig; {use}")
     return drive
 
 

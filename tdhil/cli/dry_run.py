@@ -42,7 +42,7 @@ def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, profile: Prof
 
     console = PlainConsole()
     if simulated:
-        console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
+        console.print(f"{SIMULATED}: the simulated rig, with its own limits if rig.yaml has none", style="magenta")
     show(planned, figures, limits, console)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)
@@ -84,7 +84,7 @@ def _dry_run_steps(
     console = PlainConsole()
     console.print("DRY RUN: nothing is connected, nothing moves", style="magenta")
     if simulated:
-        console.print(f"{SIMULATED}: the embedded rig, with its own limits if rig.yaml has none", style="magenta")
+        console.print(f"{SIMULATED}: the simulated rig, with its own limits if rig.yaml has none", style="magenta")
     console.print(
         f"{program.pairs} pairs of steps of at most {program.step_rad_s:.3g} rad/s ({in_nm(step_torque_nm)}) "
         f"between {program.low_rad_s:.3g} and {program.high_rad_s:.3g} rad/s, {program.duration_s:.0f} s; limits "

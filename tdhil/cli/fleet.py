@@ -57,7 +57,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
                         help="memory limit for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
-    add_left_out(parser)
+    add_left_out(parser, "left out")
     add_option(parser, OPTION["json"], help="print the summary as one JSON document on stdout")
 
 

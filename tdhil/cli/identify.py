@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_peer_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of any run: drive and address, overrides, log, simulated rig."""
-    add_drive_arguments(parser)
+    add_drive_arguments(parser, moves=True)
     add_options(parser, Topic.CYCLE, Topic.OVERRIDES, Topic.OUTPUT, Topic.SIMULATED)
     add_line_arguments(parser)
 

@@ -50,7 +50,7 @@ _GROUPS: Final = {
     },
     "prepare": {
         "doctor": "check adapter, permissions, bus, computer, profile, drive",
-        "scan": "list the drives on the bus; nothing is written to them",
+        "scan": "list the drives on the bus; writes no object or register",
         "rig": "write a rig.yaml to fill in, without a drive",
         "profiles": "show known drives, their settings and what is verified",
         "calibrate": "compute the scale of torque or speed from known quantities",

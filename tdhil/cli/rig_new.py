@@ -14,13 +14,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command `new`."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     new = actions.add_parser("new", help="write a rig.yaml to fill in", allow_abbrev=False,
-                             description="Writes a commented rig.yaml to fill in, with no drive at hand.")
+                             description="Write a commented rig.yaml to fill in, without a drive.")
     new.add_argument("file", type=Path, nargs="?", default=Path("rig.yaml"), metavar="rig.yaml",
                      help="file to write; an existing file is never overwritten")
     new.add_argument("--profile", default="generic/cia402", metavar="NAME",
                      help="vendor/model, or a .yaml file (tdhil profiles lists them; default generic/cia402)")
     new.add_argument("--load", choices=("none", "string"), required=True,
-                     help="load on the shaft: none that stores torque, or a drill string")
+                     help="load on the shaft: string for a drill string, otherwise none")
     new.add_argument("--name", metavar="NAME", help="name of the rig in reports and in tdhil trend, such as 'bench 3'")
     new.set_defaults(run=run)
 

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of trend."""
     parser.add_argument("table", type=Path, metavar="FILE", help="a table that `tdhil fleet` wrote")
     parser.add_argument("--rig", metavar="NAME", help="name of the rig in rig.yaml (default: the only one)")
-    _add_output(parser, "none")
+    _add_output(parser, "none", "left out")
     parser.set_defaults(run=run)
 
 
@@ -37,12 +37,12 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
                         help="two or more logs; each is compared with the first")
     add_settings(parser, "each run's")
-    _add_output(parser, "from the logs")
+    _add_output(parser, "from the logs", "refused")
     parser.set_defaults(run=run_compare)
 
 
-def _add_output(parser: argparse.ArgumentParser, stated: str) -> None:
-    add_left_out(parser)
+def _add_output(parser: argparse.ArgumentParser, stated: str, archived_are: str) -> None:
+    add_left_out(parser, archived_are)
     add_option(parser, OPTION["json"])
     add_report_option(parser, "report")
     add_head_options(parser, stated)

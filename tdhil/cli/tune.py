@@ -27,8 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     tune_verify.add_arguments(verify)
     string = purposes.add_parser(
         SOFT_TORQUE, allow_abbrev=False, help="a speed controller that damps the drill string",
-        description="Compute a speed controller that damps the drill string. This is also the meaning of tdhil tune"
-        " with a result and no further word.")
+        description="Compute a speed controller that damps the drill string. tdhil tune RESULT does the same.")
     tune_soft_torque.add_arguments(string)
     if isinstance(parser, CommandParser):
         parser.usual_action = SOFT_TORQUE

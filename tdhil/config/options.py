@@ -322,7 +322,8 @@ class RunOptions:
         "--max-time", "run.max_time_s", group=Topic.MOTION, common=True, unit=TIME, metavar="TIME", api=True, ge=1e-6,
         le=1e7,
         unset="what remains of `limits.time_s`", form=Form("At most, minutes", unit=MINUTE, hint="as the limits allow"),
-        help="longest duration of stage 5, such as 300 or 5min (default: what remains of limits.time_s)",
+        help="longest duration of stage 5, such as 300 or 5min (default: its planned duration; with a tolerance, what "
+        "remains of limits.time_s)",
         more="(on the command line `5min` too); longest duration of stage 5. Without a tolerance: its planned duration",
     )
     impedance: Literal["offset", "reference"] | None = option(
@@ -386,8 +387,8 @@ class RunOptions:
     )
     plant: str | None = option(
         "--plant", "run.plant", group=Topic.SIMULATED, metavar="plant.yaml", beside_rig=True, is_file=True,
-        min_length=1, help="parameters of the embedded rig",
-        more="[parameters](../../examples/plant.yaml) of the embedded rig",
+        min_length=1, help="parameters of the simulated rig",
+        more="[parameters](../../examples/plant.yaml) of the simulated rig",
     )
     simulated_torque_scale: float | None = option(
         "--simulated-torque-scale", "run.simulated_torque_scale", group=Topic.SIMULATED, unit=SHARE,
@@ -410,7 +411,7 @@ class RunOptions:
         unit=INERTIA, metavar="J", api=True, ge=0.0, le=1e9, unset="the plant's",
         form=Form("Body bolted on, kg·m²", ("simulated",), hint="none"),
         help="body of known inertia on the simulated motor shaft, such as 55 (kg·m²)",
-        more="body of known inertia on the motor shaft of the embedded rig. It replaces `plant.added_inertia_kg_m2` "
+        more="body of known inertia on the motor shaft of the simulated rig. It replaces `plant.added_inertia_kg_m2` "
              "of the plant",
     )
     letterhead: str | None = option(
@@ -421,7 +422,7 @@ class RunOptions:
     )
     trace: str | None = option(
         "--trace", "run.trace", group=Topic.SIMULATED, metavar="shaft.csv", is_file=True, min_length=1,
-        help="CSV of the true motion of the embedded rig", more="CSV of the true motion of the embedded rig",
+        help="CSV of the true motion of the simulated rig", more="CSV of the true motion of the simulated rig",
     )
     settings: Mapping[str, Setting] = field(default_factory=dict)
 
@@ -528,7 +529,7 @@ class RunDetails(_Said):
     faults: tuple[str, ...] = option(
         "--fault", group=Topic.SIMULATED, default=(), metavar="FAULT", api=True,
         form=Form("Rehearse a fault", ("simulated",), hint="none, or such as sto@hold+2s"),
-        help="rehearse a fault of the embedded rig, such as sto@hold+2s; 'list' prints all of them",
+        help="rehearse a fault of the simulated drive, such as sto@hold+2s; 'list' prints all of them",
     )
     expect: tuple[str, ...] = option(
         "--expect", group=Topic.RESULT, default=(), metavar="NAME=VALUE±TOL", api=True,
