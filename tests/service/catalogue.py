@@ -1,7 +1,8 @@
 """Texts of the service's pages, and the catalogues that translate them.
 
 ``python -m tests.service.catalogue`` brings each catalogue up to date: a new text gets an empty entry, and a text that
-no page has any more is removed. Translations stay. ``--check`` changes nothing and lists what is missing.
+no page has any more is removed. Translations stay. ``--check`` changes nothing; it lists what is missing, and says if
+a catalogue is not up to date.
 """
 
 from __future__ import annotations
@@ -209,12 +210,16 @@ def updated(text: str) -> str:
 
 
 def main(check: bool) -> int:
-    """Bring the catalogues up to date. Return 1 if a text has no translation."""
+    """Bring the catalogues up to date. Return 1 if a text has no translation, or with ``check`` if one is not."""
     missing = 0
     for path in sorted(FOLDER.glob("*.po")):
-        text = updated(path.read_text(encoding="utf-8"))
+        before = path.read_text(encoding="utf-8")
+        text = updated(before)
         if not check:
             path.write_text(text, encoding="utf-8")
+        elif text != before:
+            missing += 1
+            print(f"{path.name}: not up to date: run python -m tests.service.catalogue")
         empty = [one["msgid"] for one in entries(text)[1:] if not one["msgstr"] or "fuzzy" in one.get("flags", "")]
         missing += len(empty)
         print(f"{path.name}: {len(entries(text)) - 1} texts, {len(empty)} without a translation")
