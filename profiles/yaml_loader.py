@@ -183,6 +183,8 @@ def _wrong_value(item: dict[str, Any], value: Any, written: str | None) -> str:
     if kind in _BOUNDS:
         as_written = f"{value:.4g} ({_clean(written)})" if written else ""
         return f"must be {_BOUNDS[kind][1]} {context[_BOUNDS[kind][0]]:g}, not {as_written or _shown(value)}"
+    if kind == "string_too_short" and context["min_length"] == 1:
+        return "must not be empty"
     if kind in {"too_short", "too_long"}:
         limit = context.get("min_length", context.get("max_length"))
         return f"must have {'at least' if kind == 'too_short' else 'at most'} {limit} entries"

@@ -139,6 +139,11 @@ class Option:
         return self.kind is tuple
 
     @property
+    def free_text(self) -> bool:
+        """True for a text that a person writes: neither a choice nor a file."""
+        return self.kind is str and not self.allowed and not self.is_file
+
+    @property
     def allowed(self) -> tuple[str, ...]:
         """Return every choice in the registry at present; empty if any value is possible."""
         return self.known or tuple(self.choices)

@@ -255,14 +255,14 @@ def _bus(bus: Any) -> dict[str, Any]:
 
 
 def _options(options: Any) -> dict[str, Any]:
-    """Keep the options of the run that name no file, without the lines of rig.yaml."""
+    """Keep the options of the run that are no file and no free text, without the lines of rig.yaml."""
     from tdhil.config import OPTION
 
     kept = {}
     for name, row in _part(options).items():
         option = OPTION.get(str(name))
         source = str(_part(row).get("source", ""))
-        if option is not None and not option.is_file:
+        if option is not None and not (option.is_file or option.free_text):
             kept[name] = {"value": _part(row).get("value"),
                           "source": source if source.startswith("--") or source == "default" else "rig.yaml"}
     return kept

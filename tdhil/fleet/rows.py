@@ -14,7 +14,7 @@ from tdhil.recording import ABORTED
 from tdhil.version import __version__
 
 ROW_FORMAT: Final = 4
-"""Format number. It grows when older rows can't be in one table with new ones."""
+"""Format number. It grows when a column gets another meaning; `row_key` notices a new column by itself."""
 
 UNREAD: Final = "unread"
 """Verdict of a log without any result; `error_kind` states the reason."""
@@ -165,8 +165,9 @@ def counted(count: int, noun: str) -> str:
 
 
 def row_key(sha256: str, settings: FleetSettings) -> str:
-    """Return the key of a result: the file's content, the version of tdhil, and the settings."""
-    text = json.dumps([ROW_FORMAT, __version__, sha256, settings.asked()], sort_keys=True)
+    """Return the key of a result: the file's content, the version of tdhil, the columns, and the settings."""
+    columns = {name: PLACES.get(name, ()) for name in COLUMNS}
+    text = json.dumps([ROW_FORMAT, columns, __version__, sha256, settings.asked()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -38,6 +38,10 @@ drive_data:
   torque_scale_rel_sd: 0.03
   speed_lag_s: 0.4
   speed_lag_sd_s: 0.02
+accept_unverified: [watchdog, likely]
+modbus: {host: 192.0.2.10, port: 5020, unit: 7}
+letterhead: letterhead.yaml
+reference_inertia_kg_m2: 104
 run:
   highest_speed_rad_s: 9
   excitation: sine
@@ -64,10 +68,6 @@ run:
   simulated_speed_scale: 0.99
   simulated_added_inertia_kg_m2: 55
   realisations: 2
-accept_unverified: [watchdog, likely]
-modbus: {host: 192.0.2.10, port: 5020, unit: 7}
-letterhead: letterhead.yaml
-reference_inertia_kg_m2: 104
 """
 
 
@@ -82,7 +82,7 @@ def test_everything_has_its_place(tmp_path: Path) -> None:
     assert rig.limits is not None
     assert rig.limits.torque_nm == 400
     assert rig.run.json_ is True
-    assert (rig.line("limits.torque_nm"), rig.source("run.seed")) == (9, "rig.yaml:35")
+    assert (rig.line("limits.torque_nm"), rig.source("run.seed")) == (9, "rig.yaml:39")
     assert require_limits(rig) is rig.limits
     for option in OPTIONS:
         assert not option.at or rig.get(option.at) is not None, f"{option.at} is missing in FULL"
@@ -107,19 +107,19 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("torque_ramp_nm_s: 50\n", "", 16, "string needs 'torque_ramp_nm_s'"),
         ("watchdog_s: 0.25", "watchdog_s: 0.02", 12, "at least 5 cycles (0.025 s"),
         ("  speed_lag_s: 0.4\n", "", 23, "needs speed_lag_s"),
-        ("stepped: false", "stepped: true", 38, "exclude each other"),
+        ("stepped: false", "stepped: true", 42, "exclude each other"),
         ("torque_nm: 4e2", "torque_nm: '4e2'", 9, "write 4e2 without quotes"),
         ("  time_s: 600\n", "", 6, "'time_s' is missing"),
         ("node: 5", "node: 128", 3, "at most 127"),
-        ("json: true", "jsn: true", 39, "did you mean 'json'?"),
+        ("json: true", "jsn: true", 43, "did you mean 'json'?"),
         ("allow_reverse: false", "allow_reverse: off", 19, "write false"),
         ("ratio: 10.5", "ratio: 0", 15, "at least 1e-06"),
-        ("confidence: 0.99", "confidence: 95", 34, "less than 1"),
-        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 51, "a list"),
-        ("unit: 7}", "unit: 256}", 52, "at most 255"),
-        ("unit: 7}", "serial: /dev/ttyUSB0}", 52, "exclude each other"),
-        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 52, "1 to 247 on a serial line"),
-        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 52, "'N', 'E' or 'O'"),
+        ("confidence: 0.99", "confidence: 95", 38, "less than 1"),
+        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 25, "a list"),
+        ("unit: 7}", "unit: 256}", 26, "at most 255"),
+        ("unit: 7}", "serial: /dev/ttyUSB0}", 26, "exclude each other"),
+        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 26, "1 to 247 on a serial line"),
+        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 26, "'N', 'E' or 'O'"),
         ("  speed_lag_s: 0.4\n", "  speed_lag_s: 0.4\n  parameters: {speed_scaling: fast}\n", 24, "a number"),
     ],
 )

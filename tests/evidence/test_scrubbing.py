@@ -23,7 +23,7 @@ from tests.evidence.small_runs import LSS, PROFILE, RESULT, SERIAL, configuratio
 
 STATEMENT = PublisherStatement("The Institute", ("log", "result", "identity"), None, "", False)
 NAMES = ("first", "last", "rig", "host", "user", "folder", "file", "note", "secret", "key", "field", "mail",
-         "calibrated", "customer", "order", "place")
+         "calibrated", "customer", "order", "place", "text")
 WORD = st.text(string.ascii_lowercase, min_size=6, max_size=12).map(lambda text: f"q{text}x")
 FOLDER = "/ho" "me"      # written so that no path of a home stands in the tree
 
@@ -35,6 +35,7 @@ def seeded(path: Path, words: dict[str, str], serial: int) -> Path:
         operator=f"{w['first']} {w['last']}", note=f"at {w['note']}", customer=f"{w['customer']} AS",
         order_number=f"{w['order']} 7", place=w["place"], rig_file=f"{home}/{w['file']}.yaml",
         options={"log": {"value": f"{home}/run.mcap", "source": f"{w['file']}.yaml:3"},
+                 "place": {"value": w["text"], "source": "--place"},
                  "rate_hz": {"value": "250", "source": f"{w['file']}.yaml:3"}},
         bus={"host": {"value": f"{w['host']}.example.org", "source": "--host"}, "port": {"value": "502", "source": "-"},
              "password": {"value": w["secret"], "source": "--bus-kwargs"}},

@@ -3,8 +3,10 @@
 import csv
 import json
 import random
+import re
 import struct
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 
 import pytest
 
@@ -121,6 +123,25 @@ def test_one_host_at_a_time(tmp_path):
     pytest.importorskip("fcntl")
     with Journal(tmp_path), pytest.raises(UsageError, match="another fleet is at work"):
         Journal(tmp_path)
+
+
+def test_the_page_has_every_column():
+    """`…` on the page stands for the rest of a name."""
+    page = (Path(__file__).parents[2] / "docs/how-to/identify-many-logs.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.*?`) \|", page, re.MULTILINE)
+    whole, begun = set(), []
+    for name in (name for row in rows for name in re.findall(r"`([\w…]+)`", row)):
+        if name.endswith("…"):
+            begun.append(name.removesuffix("…"))
+        else:
+            whole.add(name)
+    assert [column for column in COLUMNS if column not in whole and not column.startswith(tuple(begun))] == []
+
+
+def test_rows_of_a_table_with_other_columns_are_not_taken(monkeypatch):
+    before = row_key("aa", FleetSettings())
+    monkeypatch.setitem(COLUMNS, "another_s", float)
+    assert row_key("aa", FleetSettings()) != before
 
 
 def test_what_a_result_hangs_on():

@@ -19,7 +19,7 @@ import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from tdhil import report
-from tdhil.config import STATED, form_options, load_rig
+from tdhil.config import form_options, load_rig
 from tdhil.config.options import OPTION, OPTIONS, Form
 from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
@@ -838,16 +838,14 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
     assert service.supervisor.live() == []
 
 
-MOTION = {"mode", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "highest_speed_rad_s", "periods", "realisations",
-          "rate_hz", "model", "confidence"}
+def _of_form(*parts: str) -> set[str]:
+    return {one.name for part in parts for one in form_options(part)}
 
 
 @pytest.mark.parametrize(("path", "fields"), [
-    ("/start/a", {"tolerance", "max_time_s", "excitation", "expect", *STATED, "seed", "fault", "real_time", *MOTION,
-                  "simulated_torque_scale", "simulated_speed_scale", "simulated_added_inertia_kg_m2"}),
-    ("/start/real", {"tolerance", "max_time_s", "excitation", "expect", *STATED, *MOTION, "accept_unverified",
-                     "accept_speed_unit", "reset_fault"}),
-    ("/rehearse/a", {"stage", "after", "duration", "real_time"}),
+    ("/start/a", _of_form("run", "acquire", "simulated")),
+    ("/start/real", _of_form("run", "acquire", "real")),
+    ("/rehearse/a", {"stage", "after", "duration", *_of_form("rehearsal")}),
     ("/fleets", {"folder", "below", "archived", "rehearsals", "tolerance", "model"}),
 ])
 def test_a_form_has_the_fields_of_the_table(client, path, fields):
