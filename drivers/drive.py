@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Final, NamedTuple, Protocol, runtime_checkable
 
 from drivers.clock import Clock
 
@@ -203,6 +203,13 @@ class Check:
     next_step: str = ""
 
 
+REACTIONS: Final = {
+    "quick_stop": "quick stop", "ramp_stop": "stop on the ramp", "fault_reaction": "fault reaction of the drive",
+    "coast": "torque off, the shaft coasts", "none": "NONE, the drive does not stop by itself",
+}
+"""Reactions of a drive to a silent host, in words, by their names in profiles."""
+
+
 @dataclass(frozen=True)
 class Preflight:
     """Findings before motion."""
@@ -217,7 +224,7 @@ class Preflight:
     torque_resolution_nm: float
     speed_resolution_rad_s: float
     watchdog_s: float                  # 0: none is armed
-    safe_action: str                   # reaction of the drive to a silent host
+    safe_action: str                   # reaction of the drive to a silent host, a key of `REACTIONS`
     filters: ReportingFilters = ReportingFilters()
     speed_loop: SpeedLoopPresent | None = None   # None: the profile names no parameter of it that is read
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
@@ -234,6 +241,11 @@ class Preflight:
     def watched(self) -> bool:
         """True if the drive stops by itself when the host is silent. If not, the operator has accepted it by name."""
         return self.watchdog_s > 0.0
+
+    @property
+    def reaction(self) -> str:
+        """Reaction of the drive to a silent host, in words."""
+        return REACTIONS.get(self.safe_action, self.safe_action)
 
     @property
     def refused(self) -> tuple[Check, ...]:

@@ -134,7 +134,7 @@ class MessageCode(Enum):
         "The operator accepted a drive that does not stop by itself if the host fails.",
         "Arm a watchdog in the drive before the next run.")
     WATCHDOG_SHARED = (
-        45, "Other clients keep the watchdog alive",
+        45, "Other clients also feed the watchdog: it may not act if tdhil fails",
         "The watchdog of the drive acts only if all clients are silent.",
         "Disconnect the other Modbus clients before the next run.")
     SPEED_UNIT_UNSEEN = (
@@ -630,7 +630,7 @@ class MessageCode(Enum):
     RUN_NOT_REACTING = (
         512, "The run's process does not respond",
         "The process was suspended, and does not read requests.",
-        "Use the hard-wired stop. The drive's watchdog stops the shaft.")
+        "Use the hard-wired emergency stop. The drive's watchdog stops the shaft.")
     UPLOAD_WITHOUT_END = (
         513, "The drive sends an object that does not end",
         "A reply to an SDO request is longer than any object that tdhil reads, or its segments do not end in time.",

@@ -266,7 +266,7 @@ def run(
     ``stop`` and call its ``ask()``.
 
     Raises the error that ended the run, with the log's name as a note, after the stop of the shaft. Raises
-    StopNotConfirmed if standstill was not confirmed: use the hard-wired stop then.
+    StopNotConfirmed if standstill was not confirmed: use the hard-wired emergency stop then.
     """
     from tdhil.runner import not_confirmed
     from tdhil.session import RunRequest, RunSession

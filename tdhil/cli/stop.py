@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
-    "Keep the hard-wired stop within reach."
+    "Keep the hard-wired emergency stop within reach."
 )
 
 NOT_CONFIRMED = "STOP NOT CONFIRMED: use the hard-wired emergency stop now."

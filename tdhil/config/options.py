@@ -254,7 +254,8 @@ class RunOptions:
     )
     accept_unverified: tuple[str, ...] = option(
         "--accept-unverified", "accept_unverified", (), group=Topic.OVERRIDES, metavar="NAME", api=True,
-        form=Form("Entries of the profile that are not verified", ("real",), hint="likely", wide=True),
+        form=Form("Accept these unverified entries of the profile", ("real",), hint="none; or names, or likely",
+                  wide=True),
         help="accept this unverified entry of the profile; 'likely' accepts all entries marked likely",
         more="unverified entries of the profile that are accepted, by name, such as `[watchdog, "
              "parameters.time_out]`; the name of a section accepts its `likely` entries, `likely` accepts all of "
@@ -326,7 +327,9 @@ class RunOptions:
     max_time_s: float | None = option(
         "--max-time", "run.max_time_s", group=Topic.MOTION, common=True, unit=TIME, metavar="TIME", api=True, ge=1e-6,
         le=1e7,
-        unset="what remains of `limits.time_s`", form=Form("At most, minutes", unit=MINUTE, hint="as the limits allow"),
+        unset="what remains of `limits.time_s`", form=Form(
+            "Longest duration of stage 5, minutes", unit=MINUTE,
+            hint="as planned; with a tolerance, as the limits allow"),
         help="longest duration of stage 5, such as 300 or 5min (default: its planned duration; with a tolerance, what "
         "remains of limits.time_s)",
         more="(on the command line `5min` too); longest duration of stage 5. Without a tolerance: its planned duration",
@@ -611,7 +614,7 @@ class TraceOptions(_Said):
     )
     rated_torque_nm: float | None = option(
         "--rated-torque", group=Topic.TRACE, unit=TORQUE, metavar="NM", gt=0, lt=1e9, api=True,
-        form=Form("Rated torque, N·m", ("trace",), hint="for a torque in % or ‰"),
+        form=Form("Torque at 100 %, N·m (rated or reference torque)", ("trace",), hint="for a torque in % or ‰"),
         help="torque that is 100 %, N·m, for torque in % or ‰",
     )
     torque_limit_nm: float | None = option(

@@ -440,5 +440,5 @@ def preflight_table(preflight: Preflight) -> Table:
         table.add_row(Text(*marks[check.outcome]), *row)
         if check.next_step:
             table.add_row("", "", "", Text(visible(check.next_step), "yellow"), "")
-    table.add_row("", "if the host falls silent", "", preflight.safe_action.replace("_", " "), "")
+    table.add_row("", "if the host falls silent", "", preflight.reaction, "")
     return table

@@ -152,7 +152,7 @@ class Watcher:
         self._board.know(
             preflight=checks, simulated=who.simulated, identity=visible(who.name),
             identity_numbers=(who.vendor, who.product, who.revision, who.serial),
-            safe_action=preflight.safe_action.replace("_", " "),
+            safe_action=preflight.reaction,
         )
 
     def stage_started(self, name: str, expected_s: float) -> None:
@@ -410,8 +410,9 @@ class ServiceOperator:
     def confirm_speed(self, speed_rad_s: float, why: str, idle: Idle) -> None:
         raise PreflightRefused(
             f"no operator can confirm that the shaft turns at {speed_rad_s:.3g} rad/s ({why})", where="service",
-            next_step="Run it once at the rig (tdhil identify). Or name the drive's position object in the profile"
-            " (position). Or accept the unit of speed by name: accept_speed_unit",
+            next_step="Start this run at the rig: tdhil identify --rig FILE. Or name the drive's position object in"
+                      " the profile"
+            " (position). Or measure the speed, and then accept the unit of speed (--accept-speed-unit)",
             entry=MessageCode.SPEED_UNIT_NOT_SEEN,
         )
 

@@ -49,7 +49,8 @@ async def login(site: Site, request: Request, body: Any) -> Response:
     """Start a session. Raises NotLoggedIn and TooManyTries."""
     if not site.access.login:
         raise UsageError("this service has no accounts", where="login",
-                         next_step="Add a user on the terminal: tdhil serve users add", entry=MessageCode.ACCOUNT_WRONG)
+                         next_step="Add a user on the terminal: tdhil serve users add NAME --data DIR",
+                         entry=MessageCode.ACCOUNT_WRONG)
     cookie, who = await _slowly(site, request, body.name.strip().lower()[:64], body.password)
     site.supervisor.note(who.name, "logged in", None, None, address=address_of(request))
     response = JSONResponse(plain(_me_view(site, who), MeView))
@@ -103,7 +104,7 @@ async def _account(site: Site, request: Request, change: Callable[[], T], what: 
     """
     if not site.access.login:
         raise UsageError("the first user is added on the terminal", where="accounts",
-                         next_step="tdhil serve users add NAME --role admin; then start with a certificate",
+                         next_step="tdhil serve users add NAME --role admin --data DIR; then start with a certificate",
                          entry=MessageCode.ACCOUNT_WRONG)
     try:
         found: T = await anyio.to_thread.run_sync(change, limiter=site.logins)

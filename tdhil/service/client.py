@@ -314,6 +314,6 @@ class Client:
         except (OSError, ValueError) as error:
             raise CommunicationLost(
                 f"the service can't be reached ({getattr(error, 'reason', error)})", where=self._url,
-                next_step="Is tdhil serve running there? If a shaft turns, use the hard-wired stop",
+                next_step="Is tdhil serve running there? If a shaft turns, use the hard-wired emergency stop",
                 entry=MessageCode.SERVER_UNREACHABLE,
             ) from error

@@ -19,7 +19,7 @@ from profiles import DataFileError, Profile, load_profile, profile_names, unit_t
 from tdhil.buses import FoundDrive, bus_named
 from tdhil.config import Limits, Rig, parse_rig
 from tdhil.errors import ExitCode
-from tdhil.service.run_state import request_wrong
+from tdhil.service.run_state import page_text, request_wrong
 from tdhil.service.schemas import (
     DraftBody,
     DraftProblemView,
@@ -115,28 +115,32 @@ def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[Draft
     """Return the entries that the rig needs and the draft does not have. A simulated rig needs no drive's entries, and
     all limits or none.
     """
-    found = [] if known.name else [DraftProblemView("name", "The rig needs its own name, such as bench 3.")]
+    found = [] if known.name else [DraftProblemView(
+        "name", page_text("The rig needs its own name, such as bench 3."))]
     if body.load == "string":
-        found += [DraftProblemView(name, "A drill string needs it.") for name in STRING_KEYS
+        found += [DraftProblemView(name, page_text("A drill string needs it.")) for name in STRING_KEYS
                   if name not in known.string]
     if known.limits or not body.simulated:
-        why = "A simulated rig has all limits or none." if body.simulated else "A real drive does not move without it."
-        found += [DraftProblemView(f"limits.{name}", f"Type this limit. {why}")
-                  for name in LIMIT_KEYS if name not in known.limits]
+        why = (page_text("Type this limit. A simulated rig has all limits or none.") if body.simulated
+               else page_text("Type this limit. A real drive does not move without it."))
+        found += [DraftProblemView(f"limits.{name}", why) for name in LIMIT_KEYS if name not in known.limits]
     if body.simulated:
         return found
     if not known.address:
-        found.append(DraftProblemView("address", "Type the address of the drive. For a rig without a drive, select"
-                                                 " Simulated."))
+        found.append(DraftProblemView("address", page_text("Type the address of the drive. For a rig without a drive,"
+                                                           " select Simulated.")))
     if profile.rated_torque_by_hand and not known.drive_data:
-        found.append(DraftProblemView("rated_torque_nm", "Type it from the name plate. The drive does not report it."))
-    found += [DraftProblemView(f"parameters.{one.name}", "Read this value at the drive, and type it. The drive does not"
-                                                         " report it over the bus.")
+        found.append(DraftProblemView("rated_torque_nm", page_text("Type it from the name plate. The drive does not"
+                                                                   " report"
+                                                                   " it.")))
+    found += [DraftProblemView(f"parameters.{one.name}", page_text("Read this value at the drive, and type it. The"
+                                                                   " drive"
+                                                                   " does not report it over the bus."))
               for one in profile.untold if one.name not in known.parameters]
     open_entries = [name for name, _ in doubtful(profile) if name not in known.accept_unverified]
     if open_entries:
-        found.append(DraftProblemView("accept_unverified", "Compare these entries with the manual, and accept them:"
-                                      f" {', '.join(open_entries)}."))
+        found.append(DraftProblemView("accept_unverified", page_text(
+            f"Compare these entries with the manual. Accept each only if both agree: {', '.join(open_entries)}.")))
     return found
 
 

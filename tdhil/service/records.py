@@ -110,7 +110,8 @@ class RunRecords:
         found = (self._store.result(run) or {}).get("acceptance")
         if not isinstance(found, Mapping):
             raise Conflict("this run has no acceptance: no values were expected of it", where=where,
-                           next_step="State them in rig.yaml (acceptance:), or request the run with expect")
+                           next_step="State them in rig.yaml (acceptance:), or request the run with expected values"
+                                     " (--expect)")
         if not (digest := self._log_sha256(run)):
             raise Conflict("this run has no log", where=where)
         return dict(found), digest

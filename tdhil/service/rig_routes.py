@@ -160,7 +160,7 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
         if "operator" not in asking.roles and site.supervisor.certainly_idle(found):
             raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that another"
                              " program may control", where=f"rig {which}",
-                             next_step="Ask an operator. If the shaft turns, use the hard-wired stop")
+                             next_step="Ask an operator. If the shaft turns, use the hard-wired emergency stop")
         return None, None, found
 
     def noted() -> None:

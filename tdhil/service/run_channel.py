@@ -21,7 +21,7 @@ from typing import Any, Final, Self
 from drivers import CommunicationLost
 from profiles import message_of
 from tdhil.errors import MessageCode, TdhilError
-from tdhil.service.run_state import Told
+from tdhil.service.run_state import Told, page_text
 
 SOCKET: Final = "control.sock"
 LOCK: Final = "alive.lock"
@@ -120,8 +120,8 @@ def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> 
             found: dict[str, Any] = json.loads(_line(peer))
     except (OSError, ValueError) as error:
         raise CommunicationLost(
-            f"the run's process does not answer ({error})", where=f"run {folder.name}",
-            next_step="If the shaft turns, use the hard-wired stop",
+            page_text(f"the run's process does not answer ({error})"), where=f"run {folder.name}",
+            next_step=page_text("If the shaft turns, use the hard-wired emergency stop"),
             entry=MessageCode.SERVER_UNREACHABLE,
         ) from error
     if found.get("error"):

@@ -286,6 +286,11 @@ class NotAllowed(TdhilError):
     exit_code = ExitCode.REFUSED
 
 
+def page_text(text: str) -> str:
+    """Return the text. The call marks it for the catalogues: a page shows it in its language."""
+    return text
+
+
 class NotLoggedIn(NotAllowed):
     """The client is not logged in."""
 
@@ -295,8 +300,8 @@ class TooManyTries(NotAllowed):
 
     def __init__(self, wait_s: float) -> None:
         self.wait_s = wait_s
-        super().__init__("too many login attempts", where="login", next_step=f"Try again in {wait_s:.0f} s."
-                         " A logged-in user can still stop, and so can the hard-wired stop")
+        super().__init__(page_text("too many login attempts"), where="login", next_step=page_text(
+            f"Try again in {wait_s:.0f} s. A logged-in user can still stop, and so can the hard-wired emergency stop"))
 
 
 class TooManyRuns(TooManyTries):
@@ -304,8 +309,8 @@ class TooManyRuns(TooManyTries):
 
     def __init__(self, wait_s: float, rig: str) -> None:
         NotAllowed.__init__(
-            self, "too many runs that show a code were requested", where=f"rig {rig}",
-            next_step=f"Nothing was started. Try again in {wait_s:.0f} s, or run it at the rig: tdhil identify")
+            self, page_text("too many runs that show a code were requested"), where=f"rig {rig}", next_step=page_text(
+                f"Nothing was started. Try again in {wait_s:.0f} s, or run it at the rig: tdhil identify --rig FILE"))
         self.wait_s = wait_s
 
 

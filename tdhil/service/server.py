@@ -196,7 +196,8 @@ def serve(
     if left_out := supervisor.rigs.left_out:
         say(f"Ignored, because the name is not that of a rig file: {', '.join(left_out)}."
             " Use NAME.yaml, with letters, digits, _, . and -")
-    say("A stop over HTTP is no emergency stop: keep the hard-wired stop within reach. Ctrl-C stops all runs.")
+    say("A stop over HTTP is no emergency stop: keep the hard-wired emergency stop within reach. Ctrl-C stops all"
+        " runs.")
     senders += [Notifier(one.at(site), lambda: web.find_runs(RunFilter(), limit=RUNS), web.trends_around, say)
                 for one in messages]
     for sender in senders:
@@ -210,7 +211,7 @@ def serve(
         alone.close()
     left = sorted({*supervisor.live(), *supervisor.not_at_rest})
     if left:
-        say(f"Standstill NOT confirmed: {', '.join(left)}. Use the hard-wired stop.")
+        say(f"Standstill NOT confirmed: {', '.join(left)}. Use the hard-wired emergency stop.")
         return int(ExitCode.STOP_NOT_CONFIRMED)
     return int(ExitCode.OK)
 

@@ -66,7 +66,7 @@ def options_of(asked: Mapping[str, Any], rig: RigFile | None = None) -> dict[str
         name = _NAMES.get(name, name)
         reason = OPTION[name].api if name in OPTION else False
         if isinstance(reason, str) and value not in (None, False):
-            raise NotAllowed(reason, where=name, next_step="Run it at the rig: tdhil identify")
+            raise NotAllowed(reason, where=name, next_step="Run it at the rig: tdhil identify --rig FILE")
         if name not in TAKEN:
             raise request_wrong("is not an option of a run over HTTP", str(given)[:60],
                                 f"Options: {', '.join(sorted(TAKEN))}")
@@ -394,7 +394,8 @@ def require_motion(rig: RigFile) -> None:
         return
     where = rig.rig.source("service.motion") or rig.path.name
     raise NotAllowed("this rig can't be moved over HTTP (service.motion: never)", where=where,
-                     next_step="Run it at the rig: tdhil identify. Or set service: {motion: attended} in its file")
+                     next_step="Run it at the rig: tdhil identify --rig FILE. Or set service: {motion: attended} in"
+                               " its file")
 
 
 def require_unwatched(rig: RigFile) -> None:

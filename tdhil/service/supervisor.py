@@ -44,6 +44,7 @@ from tdhil.service.run_state import (
     blocking,
     now,
     option_wrong,
+    page_text,
     way_to,
 )
 from tdhil.service.start_request import (
@@ -73,7 +74,7 @@ LOOK_S: Final = 0.2
 """Interval of the check whether a run is alive, s."""
 INDEX_LOOKS: Final = 10
 """Number of checks between two tries to write a failed index entry."""
-SIMULATED_STOP: Final = "no real shaft turns: the simulated drive ended with its run"
+SIMULATED_STOP: Final = page_text("no real shaft turns: the simulated drive ended with its run")
 Say = Callable[[str], None]
 
 
@@ -184,7 +185,7 @@ class Supervisor:
                 self.stop(run, who)
         if stopping:
             self.say(f"Stopping run {', '.join(stopping)}. tdhil waits {within_s:.0f} s at most for standstill."
-                     " If a shaft keeps turning, use the hard-wired stop.")
+                     " If a shaft keeps turning, use the hard-wired emergency stop.")
         end_s = time.monotonic() + within_s
         while self.live() and time.monotonic() < end_s:
             time.sleep(LOOK_S)
@@ -344,7 +345,8 @@ class Supervisor:
         if status.ended or (request.simulated and request.motion != "watched"):
             nothing = f"there is nothing to confirm: the run is {status.state}"
             self.note(who, "confirmation refused", run, status.rig, why=nothing)
-            raise Conflict(nothing, where=f"run {run}", next_step="A simulated rig asks for no confirmation")
+            raise Conflict(nothing, where=f"run {run}", next_step="The run has ended. Request it again"
+                           if status.ended else "A simulated rig asks for no confirmation")
         try:
             found = ask(self.store.place(run),
                         {"do": "confirm", "code": code, "binding": binding, "by": who, "lease": lease})
@@ -389,7 +391,8 @@ class Supervisor:
             begins = status.state is State.REQUESTED and (folder / STOP_FILE).exists()
             reached = begins or (status.pid is not None and send_signal(status.pid, folder, signal.SIGTERM))
             if not status.ended and not reached and lives(folder):
-                raise CommunicationLost(str(error), where=f"run {run}", next_step="Use the hard-wired stop") from error
+                raise CommunicationLost(str(error), where=f"run {run}",
+                                        next_step=page_text("Use the hard-wired emergency stop")) from error
         self.note(who, "stop asked", run, status.rig)
         return status
 
@@ -401,13 +404,13 @@ class Supervisor:
         folder = self.store.place(status.id)
         killed = send_signal(status.pid, folder, signal.SIGKILL)
         self.note(who, "stop asked", status.id, status.rig, process="stood still", killed=killed)
-        watchdog = next((f" ({one.found})" for one in status.preflight if "watchdog" in one.name.lower()), "")
-        done = ("The service ended the process and sends tdhil stop to the run's drive" if killed else
-                "The service could not end the process, and sends nothing to the drive")
+        done = (page_text("The service ended the process and sends tdhil stop to the run's drive") if killed else
+                page_text("The service could not end the process, and sends nothing to the drive"))
         raise NotReacting(
             "the run's process does not respond: it is suspended, by SIGSTOP or a debugger."
-            f" The drive's watchdog{watchdog} stops the shaft. {done}", where=f"run {status.id}",
-            next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired stop")
+            f" If a watchdog is armed in the drive, it now acts: {status.safe_action or 'unknown'}. {done}",
+            where=f"run {status.id}",
+            next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired emergency stop")
 
     def held_beside(self, run: str) -> Holder | None:
         """Return the other program that holds the drive of a run whose motion is over. Raises NotThere.
@@ -422,7 +425,7 @@ class Supervisor:
         status = self.store.status(run)
         self.note(who, "stop asked", run, status.rig, drive_held_by=str(holder))
         seen, said = self._stop_drive_of(self.store.request(run), status)
-        said = f"the motion of run {run} is over, and the drive is held by {holder}: {said}"
+        said = page_text(f"the motion of run {run} is over, and the drive is held by {holder}: {said}")
         self.say(said)
         return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
 
@@ -449,17 +452,17 @@ class Supervisor:
             return True, SIMULATED_STOP
         path, kept = Path(request.rig_file), self.store.place(request.id) / CONNECTION_FILE
         same = is_as_it_was(path, request.rig_sha256)
-        changed = f"{path.name} was changed or removed after the run was requested"
+        changed = page_text(f"{path.name} was changed or removed after the run was requested")
         if kept.exists():
             identity = [",".join(map(str, status.identity_numbers))] if any(status.identity_numbers) else []
             seen, said = _stop_seen([sys.executable, "-m", "tdhil.service.drive_stop", str(kept), *identity])
             if same:
                 return seen, said
             address = self._address_of(request.id) or "unknown"
-            return False, (f"{said}, on the connection that the run used ({address}); {changed}, so tdhil"
-                           " can't know whether this is still the rig's shaft")
+            return False, page_text(f"{said}, on the connection that the run used ({address}); {changed}, so tdhil"
+                                " can't know whether this is still the rig's shaft")
         if not same:
-            return False, f"{changed}, and the run stored no address of its drive: no stop was sent"
+            return False, page_text(f"{changed}, and the run stored no address of its drive: no stop was sent")
         return _stop_seen(_tdhil_stop(path))
 
     def sign_off(self, run: str, who: str, note: str) -> None:
@@ -483,7 +486,8 @@ class Supervisor:
             rig = self.rigs.get(rig_id)
             if self.rigs.built_in:
                 raise UsageError("this rig is part of tdhil and can't be changed", where=f"rig {rig_id}",
-                                 next_step="Use your own folder: tdhil serve --rigs")
+                                 next_step="Use your own folder. Start the service again, with its other options too:"
+                                           " tdhil serve --rigs DIR")
             self.refuse_busy(rig)
             try:
                 before = rig.path.read_bytes()
@@ -516,7 +520,7 @@ class Supervisor:
         folder = self.rigs.folder
         if folder is None:
             raise option_wrong("this service has no folder of rigs", f"rig {rig_id[:64]}",
-                               "Start it with tdhil serve --rigs DIR")
+                               "Start the service again, with its other options too: tdhil serve --rigs DIR")
         if not RIG_ID.fullmatch(rig_id):
             raise ValuesWrong([("id", "must be letters, digits, _, . and -, and begin with a letter or digit")])
         path = folder / f"{rig_id}.yaml"
@@ -596,8 +600,9 @@ class Supervisor:
         self.say(f"run {run}: its process is gone; stopping the drive")
         seen, said = self._stop_drive_of(request, status)
         state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
-        what = f"the process of the run was lost while it was {status.state}; {said}"
-        next_step = "" if seen else "Use the hard-wired stop. Check that every shaft is at standstill, then sign it off"
+        what = page_text(f"the process of the run was lost while it was {status.state}; {said}")
+        next_step = "" if seen else page_text("Use the hard-wired emergency stop. Check that every shaft is at"
+                                              " standstill, then sign off the stop of this run")
         reported = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION),
                     MessageCode.COMMUNICATION_LOST.code)
         by, asked = self._stops.pop(run, (status.stop.by, status.stop.asked))
@@ -727,11 +732,11 @@ def _stop_seen(command: list[str]) -> tuple[bool, str]:
     except (OSError, subprocess.TimeoutExpired) as error:
         return False, f"tdhil stop: {error}"
     if done.returncode == ExitCode.OK:
-        return True, "tdhil stop confirmed standstill"
+        return True, page_text("tdhil stop confirmed standstill")
     found: Any = None
     with suppress(ValueError):
         found = json.loads(done.stdout)
     if isinstance(found, dict) and found.get("same_drive") is False:
-        return False, (f"the drive there has another identity ({found.get('identity')}) than the drive of the run:"
-                       " tdhil stop acted on ITS shaft, not on that of the run")
-    return False, "tdhil stop did NOT confirm standstill"
+        return False, page_text(f"another drive ({found.get('identity')}) replied at the address of the run: tdhil"
+                                " stop braked the shaft of THAT drive, not the shaft of the run")
+    return False, page_text("tdhil stop did NOT confirm standstill")

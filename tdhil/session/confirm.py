@@ -60,7 +60,7 @@ def confirm_motion(
         raise PreflightRefused(
             "no operator can confirm that the shaft may move",
             where="no terminal",
-            next_step="Run it at a terminal, or add --yes if an operator stands at the hard-wired stop",
+            next_step="Run it at a terminal, or add --yes if an operator stands at the hard-wired emergency stop",
             entry=MessageCode.NOT_CONFIRMED,
         )
     _forget_what_was_typed()
@@ -165,7 +165,7 @@ def motion_summary(
 
     ``case``: the motion in place of an excitation.
     """
-    silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.safe_action.replace('_', ' ')}"
+    silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.reaction}"
     watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
     if preflight.watched and preflight.fed_by_any_client:
         watchdog, seen_to = f"{silent}; but {ANY_CLIENT}", _SHARED
@@ -182,7 +182,7 @@ def motion_summary(
         "Before you confirm:\n"
         "  [ ] brake released\n"
         "  [ ] pipe handler and people clear of the shaft\n"
-        "  [ ] hard-wired emergency stop tested and within reach (Ctrl-C stops, but is no emergency stop)\n"
+        "  [ ] hard-wired emergency stop tested and within reach (a stop by tdhil is no emergency stop)\n"
         f"{seen_to}"
     )
 

@@ -77,7 +77,7 @@ ENDS = [
     (38, "exception 2", refusing(2), 1, 6, ("exception 2", "address")),
     (38, "exception 3", refusing(3), 1, 6, ("exception 3", "value")),
     (38, "exception 4", refusing(4), 1, 6, ("exception 4", "panel")),
-    # It answers, and can't be stopped: the hard-wired stop is asked for.
+    # It answers, and can't be stopped: the hard-wired emergency stop is asked for.
     (38, "exception 2 for good", refusing(2), 10**9, 8, ("exception 2", "address")),
     (38, "busy for good", refusing(6), 10**9, 8, ("no ", "watchdog")),
     (39, "silence", silent, 10**9, 8, ("no ", "watchdog")),

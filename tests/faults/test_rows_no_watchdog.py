@@ -61,7 +61,7 @@ def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
 
 @pytest.mark.heavy
 def test_taken_by_name_and_the_line_is_gone(unarmed, bus, seen):
-    """What was accepted: nothing stops the shaft. Then the message must not say so, and the hard-wired stop is left."""
+    """What was accepted: nothing stops the shaft. The message must not promise it; the hard-wired stop is left."""
     cause = "bus-dead@speed+15s" if bus == "canopen" else "no-reply@speed+15s"
     run = unarmed(BY_NAME, "--fault", cause)
     run.assert_ended(8, "no watchdog is armed", "hard-wired emergency stop")

@@ -27,7 +27,7 @@ TEMPLATES = sorted((SERVICE / "templates").glob("*.html"))
 ELSEWHERE = {"client.py", "console.py", "mail.py", "mqtt.py", "server.py", "webhook.py", "password_file.py", "audit.py"}
 """Modules of the service whose errors no page shows: they are of the terminal."""
 _ERRORS = re.compile(r"(Error|Refused|ValuesWrong|NotAllowed|Conflict|NotThere|NoRoom|TooLarge|TooSlow|NotLoggedIn"
-                     r"|TooManyTries|NotReacting|request_wrong|option_wrong)$")
+                     r"|TooManyTries|NotReacting|request_wrong|option_wrong|page_text)$")
 
 
 class Text(NamedTuple):
@@ -102,7 +102,7 @@ def vocabulary() -> Iterator[Text]:
     """Words that the API sends and a page shows: of the tables that declare them."""
     from typing import get_args
 
-    from drivers.drive import Outcome
+    from drivers.drive import REACTIONS, Outcome
     from profiles import MessageCode
     from tdhil.config import form_options
     from tdhil.config.acceptance import ACCEPTED_QUANTITIES
@@ -145,6 +145,8 @@ def vocabulary() -> Iterator[Text]:
         yield Text("tdhil/runner/task.py", "outcome", outcome)
     for verdict in (*(one.value for one in Verdict), "pass", "fail", "cannot tell", "inconclusive"):
         yield Text("tdhil/estimation/result.py", "verdict", verdict)
+    for reaction in REACTIONS.values():
+        yield Text("drivers/drive.py", "reaction", reaction)
     for mode in ("torque", "speed"):
         yield Text("tdhil/runner/design", "mode", mode)
     for how in ("hidden", "closed", "silent"):

@@ -572,7 +572,7 @@ def test_at_this_computer_everybody_may_until_there_are_users(service):
         assert code("POST", "/rigs/a/stop", json={}) == 200
         refused = client.post(f"{API}/rigs/a/runs", json={})
         assert refused.status_code == 403
-        assert "Start the service again: tdhil serve" in refused.json()["error"]["next_step"]
+        assert "tdhil serve --tls-cert" in refused.json()["error"]["next_step"]
 
 
 @pytest.mark.heavy
@@ -760,7 +760,7 @@ def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_
         answer = stop(headers)
         assert answer.status_code == 403
         assert "no tdhil moves this rig" in answer.json()["error"]["what"]
-        assert "hard-wired stop" in answer.json()["error"]["next_step"]
+        assert "hard-wired emergency stop" in answer.json()["error"]["next_step"]
     assert stopped == []
     assert stop(guarded.sessions["operator"]).json()["said"] == "tdhil stop confirmed standstill"
     with hold(guarded.service.supervisor.rigs.get("real").address):

@@ -675,7 +675,7 @@ def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(c
     service.wait(run, "awaiting_confirmation")
     os.kill(service.store.status(run).pid, signal.SIGKILL)
     service.wait(run, "stop_not_confirmed")
-    assert "hard-wired stop" in call("GET", f"/runs/{run}", 200)["error"]["next_step"]
+    assert "hard-wired emergency stop" in call("GET", f"/runs/{run}", 200)["error"]["next_step"]
     wait_for("nobody live", lambda: not service.supervisor.live())
     refused = call.start("real", expect=409)
     assert "neither confirmed nor signed off" in refused["error"]["what"]
@@ -861,7 +861,7 @@ def test_a_form_has_the_fields_of_the_table(client, path, fields):
 def test_the_form_asks_for_minutes_and_per_cent(client):
     page = client.get("/start/a").text
     assert re.search(r'name="tolerance" placeholder="default: 5"[^>]*data-unit="%"', page)
-    assert re.search(r'name="max_time_s" placeholder="as the limits allow"[^>]*data-unit="min"', page)
+    assert re.search(r'name="max_time_s" placeholder="as planned; [^"]*"[^>]*data-unit="min"', page)
 
 
 def test_an_empty_field_of_the_start_form_shows_the_value_of_the_rig_s_file(client, rigs):

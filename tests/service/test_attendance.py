@@ -37,7 +37,7 @@ SAMPLE = Sample(1.0, 0.0, 0.0, True, 3.0, 50.0, None, Mode.TORQUE, PowerState.EN
 def preflight(*, simulated: bool) -> SimpleNamespace:
     return SimpleNamespace(
         identity=Identity(1, 2, 3, 4, "A <drive>\x1b[2J", simulated), watched=True, watchdog_s=0.5,
-        safe_action="quick_stop", fed_by_any_client=False,
+        safe_action="quick_stop", reaction="quick stop", fed_by_any_client=False,
         checks=(Check("identity", "", "found\x1b]0;x\x07", Outcome.OK, "1018h", ""),),
     )
 

@@ -89,7 +89,7 @@ def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(ser
     for words in ("tdhil stop confirmed standstill, on the connection that the run used (modbus tcp 127.0.0.1",
                   "real.yaml was changed or removed after the run was requested"):
         assert words in status.error.what
-    assert "hard-wired stop" in status.error.next_step
+    assert "hard-wired emergency stop" in status.error.next_step
     path.write_text(before)
     assert service.supervisor.blocked("real") == run
     with pytest.raises(Conflict, match="neither confirmed nor signed off"):
@@ -161,7 +161,7 @@ def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, mon
     run = lost_run(service)
     assert stops.commands[0][2:] == ["1,2,3,4"]
     assert service.store.status(run).state is State.STOP_NOT_CONFIRMED
-    assert "another identity (1, 2, 3, 99) than the drive of the run" in service.store.status(run).error.what
+    assert "another drive (1, 2, 3, 99) replied at the address of the run" in service.store.status(run).error.what
 
 
 # -- a process that stands still
@@ -176,9 +176,9 @@ def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_wa
     pid = service.store.status(run).pid
     suspend(pid)
     told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
-    for words in ("does not respond", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
+    for words in ("does not respond", "SIGSTOP", "it now acts: quick stop", "sends tdhil stop"):
         assert words in told["what"]
-    assert "hard-wired stop" in told["next_step"]
+    assert "hard-wired emergency stop" in told["next_step"]
     service.wait(run, "interrupted")
     wait_for("its end", lambda: not service.supervisor.live())
     assert [one[0] for one in stops.commands] == ["tdhil.service.drive_stop"]

@@ -102,7 +102,7 @@ def fields_of(**changed):
     ({"string": {}}, "make_up_torque_nm", "A drill string needs it"),
     ({"gear_ratio": "0"}, "gear_ratio", "Must be at least"),
     ({"simulated": True, "limits": {"torque_nm": "400"}}, "limits.time_s", "all limits or none"),
-    ({"accept_unverified": []}, "accept_unverified", "accept them: modes, quick_stop"),
+    ({"accept_unverified": []}, "accept_unverified", "only if both agree: modes, quick_stop"),
 ])
 def test_a_mistake_is_marked_at_its_field(changed, field, said):
     assert said in fields_of(**changed)[field]

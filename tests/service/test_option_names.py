@@ -123,10 +123,11 @@ def test_a_command_stays_and_an_unknown_option_too():
              "Measure it with tdhil identify --impedance, or lower --rate", "tdhil replay run.mcap --model rigid",
              "Start it with tdhil serve --rigs DIR", "tdhil tune speed r.json --string s.yaml --json > tune.json")
     assert replaced("en", *texts) == [
-        "Give “At most, minutes” 146s or more, not --max-times",
+        "Give “Longest duration of stage 5, minutes” 146s or more, not --max-times",
         "at “Controlled quantity”: use “interface” (rig's file) eth1", texts[2],
         "Measure it with tdhil identify --impedance, or lower “Control cycles per second”", *texts[4:]]
-    german = "Give “Höchstens, Minuten” 146s or more, not --max-times", "add “tdhil identify --yes” or “--x”"
+    german = ("Give “Längste Dauer der Stufe 5, Minuten” 146s or more, not --max-times",
+              "add “tdhil identify --yes” or “--x”")
     assert replaced("de", texts[0], "add --yes or “--x”", *german) == [*german, *german]      # once and again
 
 

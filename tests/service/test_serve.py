@@ -92,7 +92,7 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
         assert (refused.value.status, refused.value.holder) == (409, f"run {run}")
         first.process.kill()
         first.process.wait()
-    with pytest.raises(CommunicationLost, match="hard-wired stop"):
+    with pytest.raises(CommunicationLost, match="hard-wired emergency stop"):
         first.client.rigs()
     with served(data) as second:
         assert second.client.start("simulated-canopen", key="once", **QUICK)["id"] == run
@@ -334,7 +334,7 @@ def test_a_shaft_that_is_not_seen_at_rest_is_the_exit_code(tmp_path, capsys, mon
     monkeypatch.setattr("tdhil.service.server._uvicorn",
                         lambda app, listening, brake, *_: brake.__self__.not_at_rest.append("R1"))
     assert main(["serve", "--port", "0", "--data", str(tmp_path / "data")]) == ExitCode.STOP_NOT_CONFIRMED
-    assert "Standstill NOT confirmed: R1. Use the hard-wired stop." in capsys.readouterr().err
+    assert "Standstill NOT confirmed: R1. Use the hard-wired emergency stop." in capsys.readouterr().err
 
 
 def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, capsys, monkeypatch):

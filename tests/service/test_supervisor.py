@@ -90,7 +90,7 @@ def test_a_service_that_brakes_begins_nothing_more(service):
     assert service.supervisor.brake("the end")
     assert service.supervisor.not_at_rest == [loose]
     assert service.said[0] == (f"Stopping run {loose}, {run}. tdhil waits {STOP_S:.0f} s at most for standstill."
-                               " If a shaft keeps turning, use the hard-wired stop.")
+                               " If a shaft keeps turning, use the hard-wired emergency stop.")
     assert {service.store.status(one).stop.by for one in (loose, run)} == {"the end"}
     with pytest.raises(Conflict, match="service is ending"):
         begun(service, "hold", "b")
@@ -179,7 +179,7 @@ def test_a_stop_that_reaches_nobody_says_so(service, monkeypatch, dies):
         else:
             with pytest.raises(CommunicationLost, match="nobody answers") as lost:
                 service.supervisor.stop(run, "anna")
-            assert "hard-wired stop" in lost.value.next_step
+            assert "hard-wired emergency stop" in lost.value.next_step
         assert sent == [signal.SIGTERM]
     service.supervisor.stop(run, "anna")
     service.wait(run, "stopped")
@@ -464,7 +464,7 @@ def test_what_changes_while_a_run_is_indexed_is_indexed_once_more(service, monke
     (0, b"{}", True, "confirmed standstill"), (8, b"{}", False, "did NOT confirm"), (8, b"", False, "did NOT confirm"),
     (8, b"Traceback", False, "did NOT confirm"), (8, b"[1]", False, "did NOT confirm"),
     (8, b'{"same_drive": true}', False, "did NOT confirm"),
-    (8, b'{"same_drive": false, "identity": "9,9"}', False, "another identity (9,9)"),
+    (8, b'{"same_drive": false, "identity": "9,9"}', False, "another drive (9,9) replied"),
 ])
 def test_what_a_stop_s_process_ended_with_is_all_that_was_seen(monkeypatch, code, said, seen, words):
     monkeypatch.setattr(supervisor_module.subprocess, "run",

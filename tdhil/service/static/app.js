@@ -5,7 +5,7 @@
   const API = "/api/v1";
   const PACE_S = 3;            // shortest time in which the pace of a simulated run is measured
   const SILENT_MS = 2000;      // without an answer in this time, a stop counts as not delivered and values as old
-  const UNDELIVERED = tr("NOT DELIVERED: use the hard-wired stop");
+  const UNDELIVERED = tr("NOT DELIVERED: use the hard-wired emergency stop");
   const ENDED = ["done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"];
   const STATES = {
     requested: tr("requested"), preflight: tr("preflight"), awaiting_confirmation: tr("waiting for the code"),
@@ -13,7 +13,7 @@
     stopped: tr("stopped, at standstill"), failed: tr("failed, at standstill"), stop_not_confirmed: tr("STOP NOT CONFIRMED"),
     interrupted: tr("interrupted"),
   };
-  const OLD = tr("No answer from tdhil serve: the values are old. A moving run continues under its guard, and a watched run stops. The hard-wired stop works.");
+  const OLD = tr("No connection to tdhil serve: the values are old, and Stop on this page may not arrive. A shaft may still turn. To stop it, use the hard-wired emergency stop.");
   const byId = (id) => document.getElementById(id);
 
   /** Make an element with attributes, texts and child elements. */
@@ -71,11 +71,11 @@
   }
 
   let outside = false;
-  function away(text) {
+  function away(...parts) {
     if (outside) return;
-    const bar = byId("away");
-    bar.hidden = !text;
-    if (bar.textContent !== (text || "")) bar.textContent = text || "";
+    const bar = byId("away"), made = el("span", {}, ...parts.filter(Boolean));
+    bar.hidden = !made.textContent;
+    if (bar.textContent !== made.textContent) bar.replaceChildren(...made.childNodes);
   }
 
   /** Keep the page and its Stop. Only a request for another page leads to the login. */
@@ -85,7 +85,7 @@
     away("");
     outside = true;
     byId("away").hidden = false;
-    show(byId("away"), `${tr("Your login has ended: the values are old. Stop may still work, and this page reports the result. If not, use the hard-wired stop.")} `, el("a", { href: `/login?next=${there}` }, tr("Log in")));
+    show(byId("away"), `${tr("Your login has ended: the values are old. Stop may still work, and this page reports the result. If not, use the hard-wired emergency stop.")} `, el("a", { href: `/login?next=${there}` }, tr("Log in")));
     document.body.classList.add("stale");
   }
 
@@ -245,12 +245,12 @@
   }
 
   async function stopRig(rig) {
-    const late = setTimeout(() => away(tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })), SILENT_MS);
+    const late = setTimeout(() => away(tr("Stop of {rig}: standstill is not confirmed yet. If the shaft still turns, use the hard-wired emergency stop.", { rig: rig.name })), SILENT_MS);
     try {
       const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, Number(document.body.dataset.stopS) * 1000 + 10000);      // a stop of the drive is answered after standstill
-      if (byId("away").textContent.includes(UNDELIVERED)) away("");
+      away("");
       if (found.runs.length && !found.said) location.assign(`/runs/${found.runs[0]}/live`);
-      else away(`${rig.name}: ${byLabels(found.said)}${found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired stop")}`}`);
+      else away(`${rig.name}: `, worded(found.said), found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired emergency stop")}`);
     } catch (error) {
       away(`${tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })}${error instanceof Refused ? `. ${error.message}` : ""}`);
     } finally {
@@ -427,7 +427,7 @@
     return async () => {             // a second request starts all the same
       if (!box.checked || warned || await (measuring ||= measure())) return true;
       warned = true;
-      where.append(` ${tr("Press Start again to run anyway.")}`);
+      where.append(` ${tr("Request it again to run anyway.")}`);
       const closed = where.closest("details");
       if (closed) closed.open = true;
       where.scrollIntoView({ block: "center" });
@@ -536,12 +536,12 @@
     const steps = [];
     if (asking && !stop.asked) steps.push(el("li", {}, tr("requesting …")));
     if (stop.asked) steps.push(el("li", {}, tr("stop requested {time}", { time: clock(stop.asked) })));
-    if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ drive responded {time}", { time: clock(stop.seen) })));
+    if (stop.asked && stop.seen) steps.push(el("li", {}, tr("→ stop sent, drive replied {time}", { time: clock(stop.seen) })));
     if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}${tr("standstill {time}", { time: clock(stop.at_rest) })}`));
-    if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired stop")));
+    if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, tr("Standstill NOT confirmed: use the hard-wired emergency stop")));
     return steps;
   }
-  const unwatched = (watch) => tr("This run was not watched: it was stopped at {time}.", { time: clock(watch.lost) });
+  const unwatched = (watch) => tr("This run was not watched: braking began at {time}.", { time: clock(watch.lost) });
   /** The text of an event, in one line. */
   const eventText = (one) => [one.time_s === null ? "" : `${fixed(one.time_s, 1)} s `, english(`${one.text.startsWith(`${one.kind}:`) ? "" : `${one.kind}: `}${one.text}`)];
 
@@ -713,7 +713,7 @@
       if (confirm) {
         checklist(status.confirmation.text);
         const marks = { ok: "✓", note: "i" }, half = status.expected_half_width, whole = Object.values(status.expected_s).reduce((sum, one) => sum + one, 0);
-        byId("confirm-expected").textContent = `${half ? tr("Expected: J to {share}, about {time}.", { share: percent(half), time: span(whole) }) : tr("Expected: about {time}.", { time: span(whole) })} ${tr("{drive}; if the host fails: {action}", { drive: status.identity, action: status.safe_action })}.`;
+        byId("confirm-expected").textContent = `${half ? tr("Expected: J to {share}, about {time}.", { share: percent(half), time: span(whole) }) : tr("Expected: about {time}.", { time: span(whole) })} ${tr("{drive}; if the host fails: {action}", { drive: status.identity, action: word(status.safe_action, "reaction") })}.`;
         show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), ...[one.wanted, one.found, one.where].map((text) => el("td", {}, byLabels(text))))));
       }
       stopTimes();
@@ -749,7 +749,7 @@
       if (stop.asked || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
-      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("THE DRIVE DOES NOT RESPOND: use the hard-wired stop") : "";
+      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("NO REPLY FROM THE DRIVE: use the hard-wired emergency stop") : "";
       byId("undelivered").hidden = !text;
       if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
     }
@@ -820,6 +820,7 @@
       const text = watch.lost ? unwatched(watch)
         : unheard ? tr("The run receives nothing from this page: it stops 5 s after the last message.")
         : mine ? tr("You watch this run. If this page is hidden or closed for 5 s, the shaft stops.")
+        : watch.gone && watch.how === "silent" ? tr("{name} watches this run on another page. It has sent nothing since {time}: the run brakes 5 s after its last message.", { name: watch.by, time: clock(watch.gone) })
         : watch.gone ? tr("{name} watches this run on another page, which has been {how} since {time}: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by, how: word(watch.how, "page"), time: clock(watch.gone) })
         : tr("{name} watches this run on another page: the shaft stops 5 s after that page is hidden or closed.", { name: watch.by });
       if (where.textContent !== text) where.textContent = text;
@@ -859,7 +860,7 @@
       const real = age === null ? null : age + (now - message) / 1000;
       const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
       document.body.classList.toggle("stale", Boolean(old && (running || silent)));
-      if (silent && message) away(status && ENDED.includes(status.state) ? tr("No answer from tdhil serve.") : watched ? tr("No connection to tdhil serve: the values are old. The run stops, because it is not watched. The hard-wired stop works.") : tr("No connection to tdhil serve: the values are old. The run continues under its guard. The hard-wired stop works."));
+      if (silent && message) away(status && ENDED.includes(status.state) ? tr("No answer from tdhil serve.") : `${OLD}${mine ? ` ${tr("If this page watches the run, the run brakes 5 s after its last message.")}` : ""}`);
       else if (!silent) away("");
       byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${fixed(real, 1)} s` : span(real)) : tr("ended");
       stopAlarm();

@@ -72,9 +72,9 @@
       byId("profile-hint").textContent = one.experimental ? tr("This profile was made from documents. No run with it has been reported yet.") : "";
       const doubts = Object.entries(one.unverified);
       show(byId("by-hand"),
-        one.by_hand.length ? el("p", {}, tr("Make these settings at the drive, and tick each one. A run is refused until it reads them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
+        one.by_hand.length ? el("p", {}, tr("Make these settings at the drive, and tick each one. A run is refused if the drive does not report them:")) : el("p", {}, tr("This profile asks for no settings by hand.")),
         ...one.by_hand.map((text) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "made", value: text }), english(text))),
-        doubts.length ? el("p", { "data-field": "accept_unverified" }, tr("These entries of the profile are not verified on a drive. Compare each with the drive's manual, and accept it:")) : null,
+        doubts.length ? el("p", { "data-field": "accept_unverified" }, tr("These entries of the profile are not verified on a drive. Compare each with the drive's manual. Accept it only if both agree:")) : null,
         ...doubts.map(([name, source]) => el("label", { class: "check" }, el("input", { type: "checkbox", name: "accept", value: name }), english(`${name}: ${source}`))));
     }
     function loadChanged() {

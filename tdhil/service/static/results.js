@@ -713,7 +713,7 @@
       el("tbody", {}, ...found.budget.map((one) => line(word(one.source, "budget"), [fixed(100 * factor.coverage_factor * one.of_factor, 2), fixed(100 * J.coverage_factor * one.of_inertia, 2)]))))));
     const file = URL.createObjectURL(new Blob([`${JSON.stringify(found, null, 2)}\n`], { type: "application/json" }));
     parts.push(el("p", {}, el("a", { class: "button", href: file, download: "calibration.json" }, "calibration.json")),
-      el("p", {}, tr("Put the file beside the rig's file, and name it there: drive_data: {torque_calibration: calibration.json}. Each later run is then in calibrated N·m.")));
+      el("p", {}, tr("Put the file beside the rig's file, and enter it there: drive_data: {torque_calibration: calibration.json}. Each later run is then in calibrated N·m.")));
     return parts;
   }
 

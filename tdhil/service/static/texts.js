@@ -13,7 +13,7 @@
   const word = (text, context = "") => texts.get(context ? `${context}${BETWEEN}${text}` : text) ?? text;
 
   /** A value in a message may be a word of the vocabulary. */
-  const value = (text) => ["role", "state", "verdict"].map((context) => texts.get(context + BETWEEN + text)).find(Boolean) ?? text;
+  const value = (text) => ["role", "state", "verdict", "reaction"].map((context) => texts.get(context + BETWEEN + text)).find(Boolean) ?? (text.includes(" ") ? phrase(text) : null) ?? text;
 
   const COMMAND_OR_FLAG = /(tdhil [a-z]+(?: [a-z-]+)?(?: [\w-]+\.\w+)*(?: --[a-z][a-z-]*(?: [A-Z\d][\w.-]*| [\w-]+\.\w+)?)+)|(^|[^\w-])(--?[a-z][a-z-]*)(?![\w-])/g;
   /** Replace each option of the command line by what the pages call it: the label of this page's field, else what `Language.labels` has. A whole command is for a terminal, and stays. */
@@ -25,6 +25,7 @@
     return text.replace(COMMAND_OR_FLAG, (found, command, before, flag) => (command ? found : before + label(flag)));
   }
 
+  const SHORT = 10;            // fixed signs of a message whose values are single words: "must be {0}" would fit any sentence
   let patterns = null;
   /** Translate a message of the service, with the values in it; null if it is not known. */
   function phrase(text) {
@@ -34,9 +35,9 @@
       const pieces = key.slice(MESSAGE.length).split(/\{\w+\}/);
       return { fixed: pieces.join("").length, made, fits: new RegExp(`^${pieces.map((one) => one.replace(/[.*+?^${}()|[\]\\/]/g, "\\$&")).join("(.*?)")}$`, "s") };
     }).filter((one) => one.fixed >= LEAST).sort((a, b) => b.fixed - a.fixed);
-    for (const { fits, made } of patterns) {
+    for (const { fixed, fits, made } of patterns) {
       const found = fits.exec(text);
-      if (found) return fill(made, { ...found.slice(1).map(value) });
+      if (found && (fixed >= SHORT || found.slice(1).every((one) => !one.includes(" ")))) return fill(made, { ...found.slice(1).map(value) });
     }
     return null;
   }

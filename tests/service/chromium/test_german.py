@@ -155,7 +155,7 @@ def test_an_error_is_german_or_has_a_german_title_before_its_english_text(browse
     page.locator("[name=max_time_s]").fill("20")
     page.get_by_role("button", name="Planen").click()
     said = page.get_by_role("alert").get_by_text("Keine Bewegung passt in die Grenzen")
-    assert "20 s are too short. Give “Höchstens, Minuten” 146s or more" in said.inner_text()
+    assert "20 s are too short. Give “Längste Dauer der Stufe 5, Minuten” 146s or more" in said.inner_text()
     page.locator("[name=tolerance]").fill("viel")
     page.get_by_role("button", name="Planen").click()
     page.get_by_role("alert").get_by_text("Ein Wert ist nicht verwendbar. Nichts wurde gestartet.").wait_for()

@@ -30,7 +30,8 @@ def test_the_page_of_a_run_and_the_calibration_name_no_option_of_the_terminal(pa
     page.get_by_text("Add “Motion” prbs.").wait_for()
     page.get_by_text("Preflight", exact=True).click()
     text = page.locator("#main").inner_text()
-    for said in ("Give “At most, minutes” 146s", "Wider than “Tolerance: half-width of the repeatability, ± % of J”.",
+    for said in ("Give “Longest duration of stage 5, minutes” 146s",
+                 "Wider than “Tolerance: half-width of the repeatability, ± % of J”.",
                  "lower “Control cycles per second”", "“profile” (rig's file) states x", "“modbus.unit” (rig's file)"):
         assert said in text
     assert "--" not in text

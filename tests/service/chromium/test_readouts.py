@@ -153,7 +153,7 @@ def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served
     page.get_by_text("Stages", exact=True).click()
     table.get_by_role("row", name="acquire").get_by_text("anna requested a stop").wait_for()
     assert page.locator("#result .alarm").count() == {"stopped": 0, "lost": 3, "failed": 2}[how]
-    assert page.get_by_text("This run was not watched: it was stopped at").count() == (1 if how == "lost" else 0)
+    assert page.get_by_text("This run was not watched: braking began at").count() == (1 if how == "lost" else 0)
 
 
 def test_a_run_that_ended_before_its_data_determined_j_says_so(page, served):

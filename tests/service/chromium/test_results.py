@@ -578,7 +578,7 @@ def test_a_trace_is_added_with_its_columns_corrected_and_becomes_a_marked_run(pa
     page.set_input_files("#file", {"name": HOSTILE, "mimeType": "text/csv", "buffer": b""})
     page.get_by_text("This file is empty").wait_for()
     page.set_input_files("#file", {"name": "<b id=x>7</b>.csv", "mimeType": "text/csv", "buffer": TRACE.encode()})
-    speed, rated = page.locator("[name='columns.speed']"), page.get_by_label("Rated torque, N·m")
+    speed, rated = page.locator("[name='columns.speed']"), page.get_by_label("Torque at 100 %, N·m")
     page.get_by_text("Torque in % needs the rated torque").wait_for()
     assert rated.get_attribute("aria-invalid") == "true" and page.locator(".mini canvas").count() == 0
     assert (speed.input_value(), page.locator("[name='unit.time']").input_value()) == ("Drehzahl ist", "ms")
@@ -619,7 +619,7 @@ def test_a_refused_identification_names_and_marks_its_fields_and_keeps_what_was_
     page.goto("/upload")
     page.set_input_files("#file", {"name": "x.csv", "mimeType": "text/csv", "buffer": TRACE.encode()})
     page.locator(".wrong").wait_for()
-    rated, note = page.get_by_label("Rated torque, N·m"), page.get_by_label("Note")
+    rated, note = page.get_by_label("Torque at 100 %, N·m"), page.get_by_label("Note")
     rated.fill("480")
     rated.press("Tab")
     page.locator(".mini canvas").nth(1).wait_for()
@@ -627,7 +627,8 @@ def test_a_refused_identification_names_and_marks_its_fields_and_keeps_what_was_
     page.get_by_role("button", name="Identify").click()
     said = page.locator("#mapping-said")
     said.wait_for()
-    assert "“Rated torque, N·m”" in said.inner_text() and "--rated-torque" not in said.inner_text()
+    assert "“Torque at 100 %, N·m (rated or reference torque)”" in said.inner_text()
+    assert "--rated-torque" not in said.inner_text()
     assert (rated.get_attribute("aria-invalid"), rated.get_attribute("aria-describedby")) == ("true", "mapping-said")
     assert (rated.input_value(), note.input_value()) == ("480", "after the repair")
     wrong = [("columns", "one column can't hold two quantities"), ("rated_torque_nm", "must be above 0")]

@@ -30,7 +30,7 @@ def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
     page.get_by_role("button", name="Stop", exact=True).click()
     page.wait_for_url(f"**/runs/{run}")                # the page becomes the result
     page.get_by_text("stopped, at standstill").wait_for()
-    page.get_by_role("list", name="Stop").get_by_text("drive responded").wait_for()
+    page.get_by_role("list", name="Stop").get_by_text("drive replied").wait_for()
     assert page.locator("#result .alarm").count() == 0
 
 
@@ -102,7 +102,7 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     button = page.get_by_role("button", name="Stop", exact=True)
     button.focus()
     page.keyboard.press("Enter")
-    page.get_by_text("drive responded").wait_for()
+    page.get_by_text("drive replied").wait_for()
     served.service.wait(run, "stopped")
     page.get_by_text("stopped, at standstill").wait_for()
     page.locator("li", has_text="stop requested ").wait_for()          # the page of the result names what was requested
@@ -137,7 +137,7 @@ def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monk
         stop.click()
         page.get_by_text("real: tdhil stop confirmed standstill").wait_for()
         stop.click()
-        page.get_by_text("real: tdhil stop did NOT confirm standstill. Use the hard-wired stop").wait_for()
+        page.get_by_text("real: tdhil stop did NOT confirm standstill. Use the hard-wired emergency stop").wait_for()
 
 
 @pytest.mark.parametrize("way", ["offline", "mute"])
@@ -150,7 +150,7 @@ def test_a_stop_that_nobody_hears_says_so(page, served, way):
     else:
         page.route("**/stop", lambda route: None)           # neither an answer nor an error
     page.get_by_role("button", name="Stop", exact=True).click()
-    page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
+    page.get_by_text("NOT DELIVERED: use the hard-wired emergency stop").wait_for()
     if way == "offline":
         page.get_by_text("requesting …").wait_for(state="hidden")
     assert served.service.store.status(run).stop.asked is None
@@ -204,7 +204,7 @@ def test_six_tabs_and_a_stop_still_gets_through(page, served):
         one.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     served.service.wait(run, "stopped")
-    page.get_by_text("drive responded").wait_for()
+    page.get_by_text("drive replied").wait_for()
 
 
 def watched_run(page: Any, served: Served) -> str:
@@ -234,11 +234,11 @@ def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
         other.goto(f"/runs/{run}/live")
         other.get_by_text("watches this run on another page").wait_for()
         page.close()
-        other.get_by_text("This run was not watched: it was stopped").wait_for()     # to look is not to hold
+        other.get_by_text("This run was not watched: braking began").wait_for()     # to look is not to hold
     elif way == "offline":
         page.context.set_offline(True)
         page.get_by_text("The run receives nothing from this page").wait_for()
-        page.get_by_text("The run stops, because it is not watched").wait_for()
+        page.get_by_text("If this page watches the run, the run brakes 5 s after its last message").wait_for()
     else:
         page.evaluate(HIDE, True)
     assert lost(served, run) == how
@@ -274,9 +274,9 @@ def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
     with page.expect_response("**/stop") as answered:
         page.get_by_role("button", name="Stop", exact=True).click()
     assert answered.value.ok
-    page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
+    page.get_by_text("NOT DELIVERED: use the hard-wired emergency stop").wait_for()
     page.wait_for_timeout(500)
-    assert page.get_by_text("NOT DELIVERED: use the hard-wired stop").is_visible()
+    assert page.get_by_text("NOT DELIVERED: use the hard-wired emergency stop").is_visible()
     os.kill(served.service.store.status(run).pid, signal.SIGKILL)
     served.service.supervisor.start()
     served.service.wait(run, "interrupted")
@@ -288,7 +288,7 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     page.get_by_role("button", name="Stop", exact=True).click()
     page.reload()
     page.locator("li", has_text="requested ").wait_for()
-    page.get_by_text("drive responded").wait_for()
+    page.get_by_text("drive replied").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
@@ -301,7 +301,7 @@ def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
         page.goto(path)
         page.get_by_text(shown).first.wait_for()
         page.context.set_offline(True)
-        page.get_by_text("No answer from tdhil serve: the values are old").wait_for()
+        page.get_by_text("No connection to tdhil serve: the values are old").wait_for()
         assert page.evaluate("document.body.classList.contains('stale')")
         page.context.set_offline(False)
         page.locator("body:not(.stale)").wait_for()

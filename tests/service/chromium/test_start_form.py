@@ -124,7 +124,7 @@ def test_a_run_by_the_clock_says_first_whether_this_computer_holds_its_rate(page
     page.locator("[name=real_time]").check()
     page.locator("#pace.alarm").get_by_text("This computer does not").wait_for()
     page.locator("button[value=start]:enabled").click()
-    page.get_by_text("Press Start again to run anyway").wait_for()
+    page.get_by_text("Request it again to run anyway").wait_for()
     assert (asked, served.service.store.ids()) == (["pace"], [])
     page.locator("button[value=start]:enabled").click()
     page.wait_for_url("**/live")
