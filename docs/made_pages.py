@@ -169,23 +169,31 @@ def candidates() -> str:
 
 MEANING = {
     0: ("a result", "Use it."),
-    1: ("internal error: a mistake in tdhil", "Send the archive of `tdhil support`."),
+    1: (
+        "internal error, or a file that tdhil cannot use",
+        "Read the message. For TDH-100 and TDH-101 send the archive of `tdhil support`.",
+    ),
     2: ("wrong use, or a mistake in a file", "Correct the option, or the line of the file, that the message names."),
     3: (
         "partial result: the log is incomplete, or the log or standard output broke off",
         "Look at what is missing. Make room on the disk.",
     ),
     4: (
-        "refused before motion, or by the check of the torque's sign or of the speed's unit",
-        "Do what the message says. Nothing has moved, except in these checks.",
+        "refused before the motion of the run, or by a check that turns the shaft: sign of the torque, unit of the "
+        "speed, braking, plan of stage 5",
+        "Do what the message says. The last line states whether the shaft moved and is at standstill.",
     ),
-    5: ("communication lost; the shaft was stopped", "Check cable, termination, supply and the load of the computer."),
+    5: (
+        "communication lost",
+        "If the shaft turns, use the hard-wired emergency stop. Check cable, termination, supply and the load of the "
+        "computer.",
+    ),
     6: (
-        "drive fault, or reports of the drive that contradict each other; the shaft was stopped",
+        "drive fault, or reports of the drive that contradict each other; standstill was confirmed",
         "Read the fault in the message and in the drive's manual.",
     ),
     7: (
-        "a limit was exceeded, or leaves no room for the excitation; the shaft was stopped",
+        "a limit was exceeded, or leaves no room for the excitation; standstill was confirmed",
         "Lower the amplitude, or change the limit that the message names.",
     ),
     8: ("**the stop is not confirmed**", "**Use the hard-wired emergency stop.**"),
@@ -200,7 +208,7 @@ MEANING = {
     ),
     11: (
         "`tdhil tune`: no gains keep the margins, or the requested ones would oscillate",
-        "Request a smaller `--a` or `--compensate`, or a lower `--bandwidth`.",
+        "Follow the message: request other values, or identify again for narrower intervals.",
     ),
     12: (
         "a rehearsed fault (`--fault`) did not cause the reaction that the fault table requires, or an identified "
@@ -209,9 +217,9 @@ MEANING = {
         "Compare what was required with what was seen. Both are on the card, and in `rehearsal` and `acceptance` of "
         "the document.",
     ),
-    130: ("interrupted by Ctrl-C; the shaft was stopped", "Replay the log: what came before counts."),
+    130: ("interrupted by Ctrl-C; a run has confirmed standstill", "Replay the log: what came before counts."),
     143: (
-        "ended by SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\\\) or SIGTSTP (Ctrl-Z); the shaft was stopped",
+        "ended by SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\\\) or SIGTSTP (Ctrl-Z); a run has confirmed standstill",
         "Replay the log: what came before counts.",
     ),
 }
@@ -248,7 +256,7 @@ def exit_codes() -> str:
                 "|---|---|---|",
                 *rows,
                 "",
-                "128 + n means that another signal n ended the run. The shaft was stopped.",
+                "128 + n means that another signal n ended the run, after confirmed standstill.",
                 "",
                 "A message has three parts: what happened, with "
                 "value and limit; what tdhil did; what to do next. The classes of errors are listed under "

@@ -16,24 +16,44 @@ from profiles.visible_text import visible
 _FLAG: Final = re.compile(r"(?<![\w-])--?[a-z][a-z-]*(?![\w-])")
 
 
+STOP_SAID: Final[Mapping[bool | None, str]] = {
+    None: "tdhil stops the shaft.", True: "The shaft was stopped.", False: "Standstill was not confirmed.",
+}
+"""What tdhil did, by the outcome of the stop; None: it is not known yet."""
+
+
 class TdhilError(Exception):
     """Root of all errors that a user can cause or meet.
 
     ``what`` happened, ``where`` (file:line, object, register, stage), and ``next_step``, the remedy. Texts name options
     by their flags. ``spelling`` maps a flag to its keyword in Python; the service's pages show the label of its field.
-    ``entry``: the entry of the table of messages; without it, that of the class.
+    ``entry``: the entry of the table of messages; without it, that of the class. ``stops``: the error ends a motion.
+    Its text then states the outcome of the stop (``stopped``), once this is known.
     """
 
     spelling: Mapping[str, str] = MappingProxyType({})
     entry: MessageCode = MessageCode.INTERNAL_ERROR
 
-    def __init__(self, what: str, *, where: str = "", next_step: str = "", entry: MessageCode | None = None) -> None:
+    def __init__(
+        self, what: str, *, where: str = "", next_step: str = "", entry: MessageCode | None = None, stops: bool = False
+    ) -> None:
         super().__init__(what)
         self.what = what
         self.where = where
-        self.next_step = next_step
+        self.stops = stops
+        self.stopped: bool | None = None
+        self._remedy = next_step
         if entry is not None:
             self.entry = entry
+
+    @property
+    def next_step(self) -> str:
+        """Return the remedy; of an error that ends a motion, with the outcome of the stop before it."""
+        return f"{STOP_SAID[self.stopped]} {self._remedy}" if self.stops else self._remedy
+
+    @next_step.setter
+    def next_step(self, remedy: str) -> None:
+        self._remedy = remedy
 
     @property
     def coded(self) -> str:

@@ -40,11 +40,11 @@ class MessageCode(Enum):
     ONE_MEAN_SPEED = (
         21, "Only one mean speed",
         "The excitation has one mean speed, so viscous friction is identified from the spectral lines alone.",
-        "Add a second mean speed to the run if friction matters.")
+        "Leave --offset out: tdhil then uses two mean speeds.")
     LAGS_NOT_FIRST_ORDER = (
         22, "First-order lags do not fit the reported signals",
         "The drive filters its reported speed or torque with more than one pole, or with a moving average.",
-        "Read the filter settings in the drive, and enter them in the profile.")
+        "The interval allows for such filters. To narrow it, set first-order filters, and state them in drive_data.")
     BARELY_CONSISTENT = (
         23, "The residuals are barely consistent with the model",
         "The p-value of the residual test is near its limit.",
@@ -52,7 +52,7 @@ class MessageCode(Enum):
     LINES_TOO_WEAK = (
         24, "Some spectral lines are too weak",
         "The motion at these frequencies does not exceed the noise.",
-        "Raise --amplitude, or lower the highest frequency.")
+        "Raise --amplitude. Or lower --frequency. All lines are multiples of it.")
     PERIODS_MISSING = (
         25, "Some periods are not usable",
         "Samples are missing in these periods, or the record ended early.",
@@ -120,7 +120,7 @@ class MessageCode(Enum):
     TOTAL_INERTIA_OPEN = (
         41, "The interval of the total inertia is open on one side",
         "No excited frequency lies far enough below the resonance.",
-        "Add a lower frequency with --frequency.")
+        "Lower --frequency, which is the lowest excited frequency.")
     LOAD_SWINGS_WIDELY = (
         42, "The load oscillates differently at each mean speed",
         "The load oscillates with a large amplitude, and friction changes its response.",
@@ -176,7 +176,7 @@ class MessageCode(Enum):
     PRESENT_GAINS_THIN = (
         59, "The present gains have thin margins",
         "In the worst case, the gains in the drive keep less margin than requested.",
-        "Lower the present gains, or type in the tuned ones.")
+        "Type in the tuned gains. Do not lower the present ones if they are unstable with a lower gain.")
     LOAD_MAY_STAY_BEHIND = (
         60, "The load may not follow the motor",
         "The excited frequencies do not show whether the load turns with the motor.",
@@ -198,7 +198,7 @@ class MessageCode(Enum):
     COMMAND_REJECTED = (
         101, "A setpoint was not sent",
         "tdhil computed a setpoint outside its own limits, and the guard refused it.",
-        "The shaft was stopped. Report it with the log (tdhil support).")
+        "If the shaft turned, read in the last lines whether standstill was confirmed. Report the log (tdhil support).")
     SYSTEM_REFUSED = (
         102, "The operating system refused a request",
         "Memory, disk space or open files are used up, or a device is gone.",
@@ -398,11 +398,11 @@ class MessageCode(Enum):
     LOG_BROKEN = (
         300, "The log could not be completed",
         "The disk is full, the disk failed, or the file was moved during the run.",
-        "The shaft was stopped. Replay what was recorded with tdhil replay.")
+        "After a run, read in the last lines whether standstill was confirmed, and use tdhil replay. Then make room.")
     OUTPUT_LOST = (
         301, "The standard output was lost",
         "The terminal is closed, or the disk behind a redirection is full.",
-        "The log is complete. Show the result with tdhil replay.")
+        "Write the output elsewhere. After a run, show the result with tdhil replay.")
     AUDIT_BROKEN = (
         302, "The audit was changed",
         "The hash chain of the audit's entries does not match.",
@@ -411,7 +411,7 @@ class MessageCode(Enum):
     # --- 4xx: refused before motion ----------------------------------------------------------------------------------
     PREFLIGHT_REFUSED = (
         400, "Refused before motion",
-        "A check before motion failed, and nothing moved.",
+        "A check before the motion of the run failed. Some checks turn the shaft a little. The last line then says so.",
         "Correct what the message names, and start again.")
     OBJECT_REFUSED = (
         401, "The drive refused an object or a register",
@@ -424,7 +424,7 @@ class MessageCode(Enum):
     NOT_CONFIRMED = (
         403, "The motion was not confirmed",
         "The operator did not confirm, or no terminal is there to ask.",
-        "Run it at a terminal and type the confirmation, or add --yes.")
+        "Run it at a terminal and type the confirmation; or add --yes if a person stands at the emergency stop.")
     NO_LIMITS = (
         404, "No limits for a real drive",
         "A real drive needs limits of speed, torque and time.",
@@ -436,11 +436,12 @@ class MessageCode(Enum):
     SPEED_UNIT_NOT_SEEN = (
         406, "The unit of speed was not confirmed",
         "The drive reports no angle, and no operator confirmed the speed of the shaft.",
-        "Run it at a terminal, or add --accept-speed-unit.")
+        "Run it at a terminal. Add --accept-speed-unit only after you measured the speed. All speed limits depend"
+        " on it.")
     SPEED_UNIT_WRONG = (
         407, "The unit of speed is wrong",
-        "The shaft turns at another speed than the drive reports.",
-        "Correct the unit of speed in the profile.")
+        "The reported speed contradicts the position, or the speed that the operator saw.",
+        "Time some turns of the shaft. Correct the entry that is wrong, speed scaling or counts per turn (position).")
     BUS_UNUSABLE = (
         408, "The bus or the line cannot be opened",
         "The device is missing, in use, down, or access is denied.",
@@ -448,7 +449,7 @@ class MessageCode(Enum):
     BIT_RATE_DIFFERS = (
         409, "The bit rate differs",
         "The CAN link runs at another bit rate than requested.",
-        "Set the link's rate with ip link, or correct --bitrate.")
+        "Read the bit rate at the drive. Set the link's rate with ip link, or correct --bitrate.")
     NO_DRIVE_FOUND = (
         410, "No drive answers",
         "The drive is not powered, not connected, or has another address.",
@@ -456,7 +457,7 @@ class MessageCode(Enum):
     ANOTHER_MASTER = (
         411, "Another master controls the drive",
         "The drive is enabled already, or another device can send setpoints to it.",
-        "Disconnect the other master. tdhil wrote nothing to the drive.")
+        "Stop the shaft with that master and disable the drive there. Then disconnect it. Without one: tdhil stop.")
     SHAFT_TURNS = (
         412, "The shaft turns before the run",
         "The shaft was not at standstill when the run began.",
@@ -472,11 +473,11 @@ class MessageCode(Enum):
     SIGN_NOT_CLEAR = (
         415, "The direction of rotation is not clear",
         "The shaft moved without a clear direction during the probe.",
-        "Check the noise and the scale of the speed signal.")
+        "Check noise and scale of the speed signal. Raise limits.probe_travel_rad if the shaft may turn further.")
     BRAKING_UNCLEAR = (
         416, "The drive does not brake as commanded",
-        "A negative torque setpoint did not decelerate the shaft.",
-        "Check the sign of the torque setpoint, and whether the drive can brake.")
+        "A negative torque setpoint did not decelerate the shaft, or this could not be tried.",
+        "Check the sign of the torque setpoint, and whether the drive can brake. Or use --mode speed.")
     PREFLIGHT_TABLE = (
         417, "A setting of the drive is not as required",
         "A row of the preflight table shows another value than required.",
@@ -484,7 +485,7 @@ class MessageCode(Enum):
     DRIVE_LIMIT_TIGHTER = (
         418, "A limit in the drive is too low for the run",
         "The drive's own limit would clip the motion.",
-        "Request less motion, or allow the change with --accept-wider-limit.")
+        "Request less motion. If the machine permits more: --accept-wider-limit torque (speed, quick-stop).")
     NO_TORQUE_MODE = (
         419, "The drive has no usable torque mode",
         "The drive has no torque mode, or cannot enter it while it turns.",
@@ -500,7 +501,7 @@ class MessageCode(Enum):
     PLAN_NOT_POSSIBLE = (
         422, "No motion fits the limits",
         "The speed window, the torque limit or the time leaves no room for the requested motion.",
-        "Widen the limits in rig.yaml, or lower --amplitude.")
+        "Lower --amplitude. Widen a limit in rig.yaml only if the machine allows it.")
     IMPEDANCE_NOT_POSSIBLE = (
         423, "The impedance of the drive cannot be measured here",
         "The measurement needs the drive's speed loop, a free shaft and its own excitation.",
@@ -528,7 +529,8 @@ class MessageCode(Enum):
     UNDO_FILE_PROBLEM = (
         429, "The undo file of the drive's settings is not usable",
         "tdhil cannot write or read its record of the settings that it changed in the drive.",
-        "Name a log in a writable folder with --log.")
+        "Make the folder of the log writable. If the file is damaged, compare all limits in the drive with your"
+        " records.")
     NO_FEEDBACK = (
         430, "The drive sends no feedback",
         "The drive does not answer SYNC with its TPDO.",
@@ -540,7 +542,7 @@ class MessageCode(Enum):
     MODBUS_FUNCTIONS_MISSING = (
         432, "The profile lacks a Modbus function",
         "The profile allows no function that transfers this register in one request.",
-        "Add the function to cycle.functions in the profile.")
+        "If the drive's manual lists function 16 or 23, add it to cycle.functions in the profile.")
     LOG_DISK_FULL = (
         433, "Too little disk space for a log",
         "The disk has less free space than a run needs.",
@@ -552,7 +554,7 @@ class MessageCode(Enum):
     CONFLICT = (
         435, "The request conflicts with the present state",
         "Another run uses the rig, or the run is in another state.",
-        "Wait for the other run, or sign off its stop.")
+        "Wait for the other run. If its stop was not confirmed, check the standstill at the shaft, then sign off.")
     CODE_REFUSED = (
         436, "The operator at the rig did not confirm the run",
         "The code is wrong, used or expired, or the page that confirmed the run is closed.",
@@ -582,7 +584,7 @@ class MessageCode(Enum):
     COMMUNICATION_LOST = (
         500, "Communication with the drive was lost",
         "The drive does not answer, or its data do not arrive.",
-        "The drive's watchdog stops the shaft. Check power, cable and bus load.")
+        "If the shaft turns, use the hard-wired emergency stop. Then check power, cable and bus load.")
     NODE_SILENT = (
         501, "The node does not answer",
         "No reply to an SDO request arrived in time.",
@@ -626,7 +628,7 @@ class MessageCode(Enum):
     SERVER_UNREACHABLE = (
         511, "A server does not answer",
         "The socketcand server, the service or a run's process cannot be reached.",
-        "Check its address, and check that it is running.")
+        "If a shaft turns, use the hard-wired emergency stop. Check the address, and that the server runs.")
     RUN_NOT_REACTING = (
         512, "The run's process does not respond",
         "The process was suspended, and does not read requests.",
@@ -677,16 +679,17 @@ class MessageCode(Enum):
     # --- 7xx: limit reached ------------------------------------------------------------------------------------------
     LIMIT_HIT = (
         700, "A limit was reached",
-        "A limit of rig.yaml was reached, and the shaft was stopped.",
+        "A limit of rig.yaml was reached, and tdhil stopped the run.",
         "Request less motion, or widen the limit if the machine allows it.")
     SPEED_LIMIT = (
         701, "The speed left its window",
         "The speed left, or was about to leave, the window in rig.yaml.",
-        "Lower --amplitude or --offset, or widen the window if the machine allows it.")
+        "Lower --amplitude. If the shaft was too fast, lower --offset, else raise it. Widen the window only if the"
+        " machine allows it.")
     TORQUE_LIMIT = (
         702, "The torque exceeded its limit",
-        "The reported torque exceeded limits.torque_nm in rig.yaml.",
-        "Lower --amplitude, or raise the limit if the machine allows it.")
+        "The reported torque exceeded limits.torque_nm in rig.yaml by more than a quarter.",
+        "Lower --amplitude. Check drive_data.rated_torque_nm. Raise the limit only if the machine allows it.")
     TIME_LIMIT = (
         703, "The run exceeded its time",
         "The run took longer than limits.time_s in rig.yaml.",
@@ -702,11 +705,11 @@ class MessageCode(Enum):
     STICK_SLIP = (
         706, "The drill string sticks and slips",
         "The string oscillates at this speed, and a softer speed control does not end it.",
-        "Raise the speed.")
+        "Raise limits.speed_min_rad_s if the machine allows it, lift the bit off bottom, or reduce the weight on bit.")
     NO_ROOM_FOR_MOTION = (
         707, "No motion of stage 5 fits the limits",
         "The measured shaft leaves no motion that stays within speed, torque and time.",
-        "Widen the limits in rig.yaml, or lower --amplitude.")
+        "Lower --amplitude. Widen a limit in rig.yaml only if the machine allows it.")
     SETPOINT_NOT_FOLLOWED = (
         708, "The shaft does not follow its setpoint",
         "The speed or torque does not reach its setpoint, often at an internal limit of the drive.",
@@ -714,7 +717,7 @@ class MessageCode(Enum):
     BRAKING_HELD_BACK = (
         709, "Braking torque was held back",
         "The run is not allowed to brake by torque on this drive.",
-        "Choose a motion without braking torque.")
+        "Use --mode speed, or do what the message says.")
     DRIVE_TOO_HOT = (
         710, "The drive or motor is too hot",
         "A temperature reported by the drive exceeded its limit.",
@@ -726,13 +729,19 @@ class MessageCode(Enum):
     STEP_OVERSHOOTS = (
         712, "A step of the set speed overshoots far more than predicted",
         "The gains in the drive are not those that were tuned, or the shaft is not the identified one.",
-        "Compare the gains in the drive with the tuned ones, and lower P.")
+        "Compare P, I, their units and filters with the tuned ones. If they agree, lower I first, or identify again.")
+
+    SHAFT_CHANGED = (
+        713, "The speed changes faster than this shaft allows",
+        "The shaft became lighter during the run. A load was lost, or a coupling slipped.",
+        "Check the coupling and the load before you start again. Do not widen a limit.")
 
     # --- 8xx: stop not confirmed -------------------------------------------------------------------------------------
     STOP_NOT_CONFIRMED = (
         800, "The stop was not confirmed",
         "The stop sequence ended without a confirmed standstill, so the shaft may still turn.",
-        "Use the hard-wired emergency stop now. Approach the shaft only at standstill.")
+        "Use the hard-wired emergency stop now. Approach only a shaft that you see stand still, with the drive"
+        " locked out.")
 
     # --- 9xx: not identifiable, or the model was rejected ------------------------------------------------------------
     NOT_IDENTIFIABLE = (
@@ -746,7 +755,7 @@ class MessageCode(Enum):
     TOO_FEW_LINES = (
         902, "Too few excited frequencies",
         "The excited frequencies and mean speeds give fewer equations than there are unknowns.",
-        "Use --excitation multisine, or more mean speeds.")
+        "Use --excitation multisine, and leave --offset out: tdhil then uses two mean speeds.")
     NO_EXCITATION = (
         903, "The motion does not show the inertia",
         "Speed or torque did not change enough, or the shaft only coasted.",
@@ -858,7 +867,7 @@ class MessageCode(Enum):
     INTERRUPTED = (
         1300, "The run was interrupted",
         "The operator pressed Ctrl-C, or the system ended the process.",
-        "The shaft was stopped. Start again when ready.")
+        "After a run, read in its last lines whether standstill was confirmed.")
 
     def __init__(self, number: int, title: str, cause: str, cure: str) -> None:
         self.number = number

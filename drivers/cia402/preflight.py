@@ -239,7 +239,8 @@ def refuse_if_driven(objects: Objects) -> None:
         raise PreflightRefused(
             "the drive is already enabled by another master",
             where="6041h",
-            next_step="Disconnect that master, or disable the drive there. Nothing was written to the drive",
+            next_step="Stop the shaft with that master, disable the drive there, and disconnect the master. Without a"
+            " master: tdhil stop. Nothing was written to the drive",
             entry=MessageCode.ANOTHER_MASTER,
         )
 

@@ -78,7 +78,8 @@ def refuse_if_driven(access: RegisterAccess, profile: ModbusProfile, where: str)
         raise PreflightRefused(
             f"the drive is enabled already (status {status:04X}h): another master commands it",
             where=where,
-            next_step="Disconnect that master, or disable the drive there. Nothing was written to the drive",
+            next_step="Stop the shaft with that master, disable the drive there, and disconnect the master. Without a"
+            " master: tdhil stop. Nothing was written to the drive",
             entry=MessageCode.ANOTHER_MASTER,
         )
 

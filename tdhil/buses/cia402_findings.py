@@ -100,5 +100,6 @@ def _state(objects: cia402.Objects) -> DoctorFinding:
         known = f", error code {code:04X}h" if code is not None else ""
         return bad("state", f"{state.value}{known}", "Remove its cause, then start a run with --reset-fault")
     if state is cia402.State.OPERATION_ENABLED:
-        return bad("state", "operation enabled: another master controls it", "Take that master off the bus first")
+        return bad("state", "operation enabled: another master controls it",
+                   "Stop the shaft and disable the drive there, then disconnect that master")
     return ok("state", state.value)

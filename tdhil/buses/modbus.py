@@ -728,7 +728,7 @@ def _state(profile: ModbusProfile, word: int) -> DoctorFinding:
     if state in (PowerState.FAULT, PowerState.FAULT_REACTION):
         return bad("state", said, "Remove its cause, then start a run with --reset-fault")
     if state is PowerState.ENABLED:
-        return bad("state", f"{said}: another master controls it", "Disable it there first")
+        return bad("state", f"{said}: another master controls it", "Stop the shaft and disable the drive there first")
     if profile.control.remote is not None and not driver.seen(profile.control.remote, word):
         return bad("state", f"{said}: the fieldbus has no control",
                    "Switch the drive from its panel (local) to remote, and check its command source")

@@ -221,8 +221,7 @@ def _left(folder: Path) -> Iterator[DoctorFinding]:
             yield of_error("left in a drive", error)
             continue
         yield bad("left in a drive", f"{drive}: {', '.join(one.text for one in settings)} ({path.name})",
-                  "A run is active, or one died. The next run on that drive restores them. Or set them by hand, "
-                  "and remove the file")
+                  "If a run is active, wait for its end. Otherwise the next run on that drive restores them")
 
 
 def _profile(options: RunOptions, connection: Connection) -> Iterator[DoctorFinding]:

@@ -69,8 +69,9 @@ def run(namespace: argparse.Namespace) -> int:
         print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
         return int(code)
     except KeyboardInterrupt:
+        # a script that reads the exit code only must not take this for a stop
         print(NOT_CONFIRMED, file=sys.stderr)  # noqa: T201
-        raise
+        return int(ExitCode.STOP_NOT_CONFIRMED)
     code = ExitCode.OK if report.ended is Ended.AT_REST else ExitCode.STOP_NOT_CONFIRMED
     if namespace.json is True:
         print(json.dumps(_document(report, code), ensure_ascii=False, indent=2))  # noqa: T201

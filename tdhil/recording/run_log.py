@@ -27,6 +27,7 @@ class RunLog:
         self._builder = RecordingBuilder()
         self._run = dict(run)
         self._dropped = 0
+        self._failed_s = 0.0
         self._virtual = array("d")
         self._commanded = array("d")
         self.frame: FrameTap = writer.frame
@@ -66,12 +67,17 @@ class RunLog:
 
     def failure(self, time_s: float, error: BaseException) -> None:
         """Record the error that ended a run, with its traceback in the log; the user gets only the message."""
+        self._failed_s = time_s
         self.configure(ended=ended_by(error, time_s))
         if isinstance(error, Interrupted):
             self._writer.event(Event(time_s, INTERRUPTED, str(error)))
             return
         trace = "".join(traceback.format_exception(error))
         self._writer.event(Event(time_s, FAILURE, f"{type(error).__name__}: {error}", trace))
+
+    def stopped(self, error: BaseException) -> None:
+        """Record again the error that ended a run: its text now states the outcome of the stop."""
+        self.configure(ended=ended_by(error, self._failed_s))
 
     def stage(self, stage: Stage) -> Stage:
         """Log a stage that has ended. Return it as logged: degraded if the log is not complete."""

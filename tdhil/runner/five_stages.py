@@ -12,8 +12,8 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
-from profiles import MessageCode
 from tdhil.config import OPTION, identified_before_echo
+from tdhil.errors import MessageCode, TdhilError
 from tdhil.estimation import torque_answer
 from tdhil.recording import ImpedanceInput, LagPrior, RunLog
 from tdhil.runner import preconditions, stage_log
@@ -124,6 +124,10 @@ class Runner:
                         self._say(error_text)
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
+                if isinstance(cause, TdhilError) and cause.stops:
+                    cause.stopped = report.confirmed
+                    with suppress(Exception):
+                        self._log.stopped(cause)
                 if cause is None and report.stayed_in_torque_mode:
                     cause = mode_not_left()
                     self._log_failure(cause)

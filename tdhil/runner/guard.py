@@ -249,14 +249,14 @@ class Guard:
             raise LimitHit(
                 f"torque {in_nm(sample.torque_nm)} is above the limit of {self._limits.torque_nm:g} N·m",
                 where=_at(sample),
-                next_step="The shaft was stopped. Check that rig.yaml has the drive's rated torque",
+                stops=True, next_step="Lower the amplitude. Check that rig.yaml has the drive's rated torque",
                 entry=MessageCode.TORQUE_LIMIT,
             )
         if self.left_s(sample.time_s) < 0.0:
             raise LimitHit(
                 f"the run has taken longer than the limit of {self._limits.time_s:g} s",
                 where=_at(sample),
-                next_step="The shaft was stopped. Raise limits.time_s in rig.yaml or request fewer periods",
+                stops=True, next_step="Raise limits.time_s in rig.yaml or request fewer periods",
                 entry=MessageCode.TIME_LIMIT,
             )
         self._check_mode(command, sample)
@@ -272,7 +272,7 @@ class Guard:
                 f"the drive's internal limit has been active in torque mode for the limit of {LIMITED_S:g} s:"
                 " its torque is not the commanded one",
                 where=f"statusword {sample.status:04X}h, bit 11, at {sample.time_s:.3f} s",
-                next_step="The shaft was stopped. Check on its panel which limit acts",
+                stops=True, next_step="Check on its panel which limit acts",
                 entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )
         if self.expected is PowerState.ENABLED and not in_torque_mode and not self.torque_offset_nm > 0.0:
@@ -321,15 +321,16 @@ class Guard:
                     f"speed {speed_rad_s:.3f} rad/s is above the limit of {limits.speed_max_rad_s:g} rad/s"
                 ),
                 where=_at(sample),
-                next_step="The shaft was stopped. "
-                + self._helps("Check whether the load was lost, and limits.speed_max_rad_s in rig.yaml"),
+                stops=True, next_step=self._helps(
+                    "Check whether the load was lost, and limits.speed_max_rad_s in rig.yaml"),
                 entry=MessageCode.SPEED_LIMIT,
             )
         if not limits.allow_reverse and speed_rad_s < -self._reverse_rad_s:
             raise LimitHit(
                 f"the shaft turns backwards ({speed_rad_s:.3f} rad/s) and allow_reverse is false",
                 where=_at(sample),
-                next_step="The shaft was stopped. Reverse rotation unscrews tool joints",
+                stops=True, next_step=self._helps(
+                    "Lower the amplitude or raise the offset. Check whether the load drives the shaft back"),
                 entry=MessageCode.TURNED_BACKWARDS,
             )
 
@@ -344,14 +345,14 @@ class Guard:
                     f" {limits.speed_max_rad_s:g} rad/s"
                 ),
                 where=_at(sample),
-                next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or the offset')}",
+                stops=True, next_step=self._helps("Lower the amplitude or the offset"),
                 entry=MessageCode.SPEED_LIMIT,
             )
         if predicted < lowest:
             raise LimitHit(
                 self._besides(f"the shaft is about to turn backwards: {_leads(sample, command, predicted)}"),
                 where=_at(sample),
-                next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or raise the offset')}",
+                stops=True, next_step=self._helps("Lower the amplitude or raise the offset"),
                 entry=MessageCode.TURNED_BACKWARDS,
             )
         self._check_lower_end(sample)
@@ -364,8 +365,8 @@ class Guard:
                     f"the speed has left its window: {speed_rad_s:.3f} rad/s is below {limits.speed_min_rad_s:g} rad/s"
                 ),
                 where=_at(sample),
-                next_step="The shaft was stopped. "
-                + self._helps("Lower the amplitude or raise the offset. Check whether the load increased"),
+                stops=True, next_step=self._helps(
+                    "Lower the amplitude or raise the offset. Check whether the load increased"),
                 entry=MessageCode.SPEED_LIMIT,
             )
 
@@ -397,8 +398,9 @@ class Guard:
             raise CommunicationLost(doubt.what, where=_at(sample), next_step=doubt.helps,
                                     entry=MessageCode.FEEDBACK_REPEATS)
         if doubt.lighter:
-            raise LimitHit(doubt.what, where=_at(sample), next_step=f"The shaft was stopped. {doubt.helps}")
-        raise ReportsContradict(doubt.what, where=_at(sample), next_step=f"The shaft was stopped. {doubt.helps}")
+            raise LimitHit(doubt.what, where=_at(sample), stops=True, next_step=doubt.helps,
+                           entry=MessageCode.SHAFT_CHANGED)
+        raise ReportsContradict(doubt.what, where=_at(sample), stops=True, next_step=doubt.helps)
 
     def _check_mode(self, command: Command, sample: Sample) -> None:
         if self.expected is not PowerState.ENABLED:
@@ -411,7 +413,7 @@ class Guard:
             raise ModeNotConfirmed(
                 f"the drive left its mode: {command.mode.value} mode is commanded, but it displays {shown}",
                 where=f"mode display (6061h in CiA 402) at {sample.time_s:.3f} s",
-                next_step="The shaft was stopped. Check whether another master, a tool or a parameter changed it",
+                stops=True, next_step="Check whether another master, a tool or a parameter changed it",
             )
 
     def torque_words(self, torque_nm: float, limit_active: bool, disturbed: bool = False) -> tuple[str, str]:
@@ -424,8 +426,8 @@ class Guard:
             by = "the drive's internal limit acts" if limit_active else f"at its limit of {limit_nm:g} N·m"
             return (
                 f"torque {in_nm(torque_nm)}, {by}",
-                "Check whether a brake or the load holds the shaft. If not, a higher torque limit is needed"
-                " (limits.torque_nm in rig.yaml, and the drive's own)",
+                "Check whether a brake or the load holds the shaft. If not, and if the machine allows it, raise the"
+                " torque limit (limits.torque_nm in rig.yaml, and the drive's own)",
             )
         if disturbed or self.disturbed:
             return f"torque {in_nm(torque_nm)}, not at its limit of {limit_nm:g} N·m", LIGHTEN
@@ -444,7 +446,7 @@ class Guard:
                 f" {following.speed_rad_s:.3f} rad/s reported, deviating since {following.since_s:.1f} s and no nearer"
                 f" for {following.within_s:g} s; {torque}",
                 where=_at(sample),
-                next_step=f"The shaft was stopped. {helps}",
+                stops=True, next_step=helps,
                 entry=MessageCode.SETPOINT_NOT_FOLLOWED,
             )
 

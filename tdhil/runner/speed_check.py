@@ -196,7 +196,7 @@ LONGEST_WAIT_S = 60.0     # s; longest wait for these turns
 BY_POSITION, BY_OPERATOR, BY_NAME, UNSEEN = "position", "operator", "--accept-speed-unit", "nobody"
 _WHERE = "unit of speed"
 _CHECK = "Check the speed scaling in the profile (unit of the speed's setpoint and of the reported speed)"
-_IF_RIGHT = "; if the speed is right, check its position entry (counts per turn), or set position: null there"
+_IF_RIGHT = "; if a timed turn shows that the speed is right, correct its position entry (counts per turn)"
 
 
 @dataclass(frozen=True)

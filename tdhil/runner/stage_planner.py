@@ -55,7 +55,7 @@ class StagePlanner:
             raise LimitHit(
                 f"the speed window of {width:.3g} rad/s leaves no room for an excitation: {loop.guard.disturbed}",
                 where="plan of stage 5",
-                next_step=f"The shaft was stopped. {LIGHTEN}",
+                stops=True, next_step=LIGHTEN,
                 entry=MessageCode.NO_ROOM_FOR_MOTION,
             )
         room = Guard.room(limits, task.assumptions, free)
@@ -77,7 +77,7 @@ class StagePlanner:
             raise LimitHit(
                 f"no plan of stage 5 fits the shaft that stages 2 and 3 measured: {error}",
                 where="plan of stage 5",
-                next_step=f"The shaft was stopped. {error.next_step}",
+                stops=True, next_step=error.next_step,
                 entry=MessageCode.NO_ROOM_FOR_MOTION,
             ) from error
         plan = planned.plan

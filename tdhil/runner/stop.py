@@ -860,5 +860,5 @@ def not_confirmed(report: StopReport) -> StopNotConfirmed:
     return StopNotConfirmed(
         "the stop was NOT confirmed: " + (report.trouble[-1] if report.trouble else "no standstill seen"),
         where="stop sequence",
-        next_step="Use the hard-wired emergency stop now. The drive's own watchdog stops the shaft if it was armed",
+        next_step="Use the hard-wired emergency stop now. Do not rely on the drive's watchdog",
     )

@@ -114,8 +114,8 @@ def confirm_speed(
             f"the operator did not confirm that the shaft turns {turning}, as the drive reports: the unit of speed in"
             " the profile is probably wrong",
             where="prompt",
-            next_step="Time one turn of the shaft. Divide the measured time by the expected time: this is the factor by"
-            " which the speed scaling in the profile is wrong",
+            next_step="Time ten turns of the shaft. Multiply the speed scaling in the profile by the expected time"
+            " divided by the measured time. Then repeat this check",
             entry=MessageCode.SPEED_UNIT_WRONG,
         )
 

@@ -62,7 +62,8 @@ class DriveHeld(PreflightRefused):
         self.holder = holder
         super().__init__(
             f"the drive is held by {holder}", where=address,
-            next_step="Wait until that run has ended, or end it there; nothing has moved (tdhil stop always works)",
+            next_step="This command moved nothing; the other run may turn the shaft. Wait until it ends, or end it"
+            " there. tdhil stop is not blocked",
         )
 
 

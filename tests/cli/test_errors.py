@@ -118,3 +118,13 @@ def test_without_json_a_wrong_value_is_a_line_on_stderr_alone(capsys: pytest.Cap
 def test_ctrl_c_is_called_by_its_name() -> None:
     assert "Ctrl-C" in str(Interrupted(signal.SIGINT))
     assert "SIGTERM" in str(Interrupted(signal.SIGTERM))
+
+
+@pytest.mark.parametrize(("stopped", "said"), [
+    (None, "tdhil stops the shaft. Lower it"), (True, "The shaft was stopped. Lower it"),
+    (False, "Standstill was not confirmed. Lower it"),
+])
+def test_an_error_that_ends_a_motion_claims_a_stop_only_if_it_was_confirmed(stopped: bool | None, said: str) -> None:
+    error = LimitHit("too fast", next_step="Lower it", stops=True)
+    error.stopped = stopped
+    assert (str(error), error.next_step) == (f"too fast. {said}", said)

@@ -247,5 +247,5 @@ def test_ctrl_c_ends_the_watching_only(turning, number):
     with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stderr=-1) as child:
         assert wait_for("stop", lambda: master.state() == 0x07)
         child.send_signal(number)
-        assert child.wait(HANGS_S) in (130, -2)
+        assert child.wait(HANGS_S) in (8, -2)      # not confirmed: a script must not take it for a stop
     assert wait_for("rest", lambda: abs(master.objects.read(0x606C, signed=True)) < 5)

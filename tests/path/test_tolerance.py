@@ -114,7 +114,7 @@ def test_one_tone_is_known_beforehand_to_tell_nothing():
     done = tdhil("identify", "--dry-run", "--excitation", "sine")
     assert done.code == 0
     assert "no interval of J is expected" in done.out.replace("\n", " ")
-    assert done.out.startswith("SIMULATED: the embedded rig")      # nobody said where a drive is
+    assert done.out.startswith("SIMULATED: the simulated rig")      # nobody said where a drive is
 
 
 # -- quantities ----------------------------------------------------------------------------------------------

@@ -267,7 +267,7 @@ def _planned(
     if not scale > 0.0:
         raise LimitHit(
             f"the limits leave no room for a torque offset at {mean_rad_s:.2f} rad/s", where="plan of stage 5",
-            next_step="The shaft was stopped. Widen the speed window, or raise limits.torque_nm",
+            stops=True, next_step="Widen the speed window, or raise limits.torque_nm",
             entry=MessageCode.NO_ROOM_FOR_MOTION,
         )
     periods = min(wish.periods or SETTLE + COUNTED, most_periods)
@@ -275,7 +275,7 @@ def _planned(
         raise LimitHit(
             f"{periods} periods of {PERIOD_S:g} s are too few: {SETTLE} settle, and {LEAST_COUNTED} must follow",
             where="--periods, and limits.time_s in rig.yaml",
-            next_step=f"The shaft was stopped. Use {SETTLE + LEAST_COUNTED} or more",
+            stops=True, next_step=f"Use {SETTLE + LEAST_COUNTED} or more",
             entry=MessageCode.NO_ROOM_FOR_MOTION,
         )
     swing, pull, peak = (_peak(scale * lines, phases_rad) for _, lines in limits)

@@ -130,6 +130,6 @@ class SpeedSteps:
                         f"speed {sample.speed_rad_s:.3f} rad/s after a step from {program.low_rad_s:.3f} to"
                         f" {program.high_rad_s:.3f} rad/s: the overshoot is above the limit of {allowed:.3g} rad/s",
                         where=f"step at {sample.time_s:.1f} s",
-                        next_step="The shaft was stopped. Compare the gains in the drive with the tuned ones, and lower"
+                        stops=True, next_step="Compare the gains in the drive with the tuned ones, and lower"
                         " P",
                         entry=MessageCode.STEP_OVERSHOOTS)

@@ -153,7 +153,7 @@ class _LoopWatch:
             raise LimitHit(
                 f"the loop's errors have put {host.put_in_j:.0f} J into the shaft (limit {self._most_j:.0f} J)",
                 where=where,
-                next_step="The shaft was stopped. Check the lags of the result: identify again",
+                stops=True, next_step="Check the lags of the result: identify again",
                 entry=MessageCode.VIRTUAL_STRING_UNSTABLE,
             )
         if len(self._squares) == self._squares.maxlen:
@@ -166,6 +166,6 @@ class _LoopWatch:
                 raise LimitHit(
                     f"the loop oscillates with {in_nm(rms)} rms at the main shaft, above the limit of"
                     f" {in_nm(self._peak_nm)} of string and bit",
-                    where=where, next_step="The shaft was stopped. Check the lags of the result: identify again",
+                    where=where, stops=True, next_step="Check the lags of the result: identify again",
                     entry=MessageCode.VIRTUAL_STRING_UNSTABLE,
                 )
