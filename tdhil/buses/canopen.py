@@ -652,7 +652,7 @@ _STATES: dict[str, tuple[Grade, str]] = {
     "ERROR-WARNING": ("note", "Errors add up: check bit rate, termination (60 ohms between CAN_H and CAN_L) and cable"),
     "ERROR-PASSIVE": ("bad", "Check bit rate, termination (60 ohms between CAN_H and CAN_L), and other nodes"),
     "BUS-OFF": ("bad", "Correct cable or bit rate, then: sudo ip link set {0} down && sudo ip link set {0} up"),
-    "STOPPED": ("bad", "Bring it up: sudo ip link set {0} up type can bitrate 500000"),
+    "STOPPED": ("bad", "Read the bit rate at the drive. Then: sudo ip link set {0} up type can bitrate RATE"),
 }
 _UNKNOWN_STATE: tuple[Grade, str] = ("note", "")
 

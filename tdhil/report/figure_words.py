@@ -65,7 +65,7 @@ FIGURES: Final = (
     FigureMeaning("damping *", "least damping ratio below the second mode; 0: no decay",
            ("least damping", "least damping of the lowest modes")),
     FigureMeaning("no noise *", "critical speed without noise of the bit"),
-    FigureMeaning("J wrong", "damping, and critical speed (cure), if J is wrong by this much"),
+    FigureMeaning("J wrong", "damping, and critical speed, if J is wrong by this much"),
     FigureMeaning("errors of J", "examples: both are errors of the acceleration regression"),
     FigureMeaning("from", "file that J is from: a result, or the log of a run"),
     FigureMeaning("profile", "drive profile: names and units of the drive's own gains"),

@@ -24,7 +24,7 @@ _COLOURED = {"Green": "stable", "Yellow": "at risk", "Red": "stick-slip"}
 HOW_TO_READ = (
     "Find the bit torque or the weight on bit on the left, and the set speed below. "
     + " ".join(f"{colour}: {words_of(state)}" for colour, state in _COLOURED.items())
-    + " From yellow, raise the set speed into green, then lower it.")
+    + " From yellow, raise the set speed into green. At a yellow speed, a bit that sticks again stays stuck.")
 _COLOURS = {"stable": "#7fbf7f", "at risk": "#f2d16b", "stick-slip": "#d9695f"}
 
 

@@ -438,8 +438,8 @@ def _speed(part: Part, document: Part) -> str:
 def _wrong(part: Part) -> str:
     if not part["stable"]:
         return "unstable"
-    cure = "" if part["cure_rpm"] is None else f", cure {part['cure_rpm']:.0f}"
-    return f"{part['damping']:.2f}{cure}"
+    critical = "" if part["cure_rpm"] is None else f", {part['cure_rpm']:.0f} rpm"
+    return f"{part['damping']:.2f}{critical}"
 
 
 def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
