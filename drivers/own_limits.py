@@ -29,6 +29,7 @@ TITLES = {
     "quick_stop_deceleration": "quick-stop ramp",
 }
 """`set_to` of a profile's parameter → title of its row in preflight."""
+NOT_KEPT = "The drive did not keep the value. Check whether it is locked or its range is narrower"
 FLOAT_ROUNDING = 1e-6
 """Relative difference below which two values count as equal: above the rounding of a 32-bit float, 6e-8."""
 
@@ -56,7 +57,7 @@ class OwnLimits:
 
     def written(
         self, table: PreflightTable, limit: str, title: str, wanted: str, now: str, before: str, good: bool, where: str,
-        mend: str = "", *, wider: bool = False,
+        mend: str = NOT_KEPT, *, wider: bool = False,
     ) -> bool:
         """Add the row of a written limit, with its former value. Return whether it reads back as wanted."""
         changed = "" if before == now else f" (was {before})"

@@ -15,7 +15,7 @@ from drivers.drive import DriveLimits, ReportingFilters, SpeedLoopPresent
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import RANGES, per_count, register_name, settle, to_counts
-from drivers.own_limits import LIMIT_SET_BY, TORQUE, OwnLimits
+from drivers.own_limits import LIMIT_SET_BY, NOT_KEPT, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable, agreed_rated_torque, spare
 from drivers.speed_loop import ReadSetting, read_speed_loop
 from profiles import unit_text
@@ -285,7 +285,7 @@ def _write_limit(
     if not parameter.writable_in_operation:
         write_setting(table, access, parameter, limits, rated_nm, values)
         return
-    mend = parameter.advice or "The drive did not keep the value. Check whether it is locked or its range is narrower"
+    mend = parameter.advice or NOT_KEPT
     try:
         back = access.change(register, setting.counts)
     except PreflightRefused as error:
@@ -331,7 +331,7 @@ def write_setting(
         back = access.change(register, counts)
         return show(back * lsb, parameter), back == counts
 
-    advice = parameter.advice or "The drive did not keep the value. Check whether it is locked or its range is narrower"
+    advice = parameter.advice or NOT_KEPT
     return table.attempt(parameter.title, wanted, where, work, advice)
 
 

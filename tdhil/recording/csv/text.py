@@ -242,7 +242,8 @@ def encoding_of(path: Path) -> str:
     if not text or "\0" in text[:1024] or odd > 0.05 * len(text):
         raise CsvUnusable(
             "this is neither text nor a run.mcap", where=str(path),
-            next_step="Export the trace as CSV, in UTF-8 (UTF-16 needs its byte order mark)",
+            next_step="The log is damaged from its start: look for another copy" if path.suffix == ".mcap"
+            else "Export the trace as CSV, in UTF-8 (UTF-16 needs its byte order mark)",
         )
     return found
 
