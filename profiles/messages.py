@@ -310,9 +310,9 @@ class MessageCode(Enum):
         "A column for time, speed or torque is missing, has no known unit, or several columns match.",
         "Give name and unit of each column, such as --columns time=t:ms speed=n:rpm torque=M:Nm.")
     RATED_TORQUE_MISSING = (
-        222, "The rated torque is not given",
+        222, "The torque at 100 % is not given",
         "The trace states torque as a share of the rated torque.",
-        "Add --rated-torque in N·m, from the name plate.")
+        "Add --rated-torque in N·m, the rated or the reference torque, as the drive uses it.")
     STRING_MISSING = (
         223, "No drill string is named",
         "Tuning needs the string below the drive.",

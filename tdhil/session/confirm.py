@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rich.console import Console
 
@@ -28,6 +28,11 @@ T = TypeVar("T")
 
 WORD, MOUNTED = "MOVE", "MOUNTED"
 SPEED_FLAG = "--accept-speed-unit"
+CHECKLIST: Final = (
+    "brake released", "pipe handler and people clear of the shaft",
+    "hard-wired emergency stop tested and within reach (a stop by tdhil is no emergency stop)",
+)
+"""What a person checks before each motion."""
 _UNWATCHED = "  [ ] an operator stays at that stop for the whole run: nothing else stops the shaft if this host fails\n"
 _SHARED = (
     "  [ ] every other client of this drive is switched off (PLC, panel, historian, gateway); an operator stays at\n"
@@ -169,6 +174,7 @@ def motion_summary(
     watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
     if preflight.watched and preflight.fed_by_any_client:
         watchdog, seen_to = f"{silent}; but {ANY_CLIENT}", _SHARED
+    points = "".join(f"  [ ] {point}\n" for point in CHECKLIST)
     return (
         f"\nThis run will move {visible(preflight.identity.name)}:\n"
         f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"
@@ -179,11 +185,7 @@ def motion_summary(
         f"  duration        at most {minutes(limits.time_s)}\n"
         f"  watchdog        {watchdog}\n"
         f"{_taken(unverified)}"
-        "Before you confirm:\n"
-        "  [ ] brake released\n"
-        "  [ ] pipe handler and people clear of the shaft\n"
-        "  [ ] hard-wired emergency stop tested and within reach (a stop by tdhil is no emergency stop)\n"
-        f"{seen_to}"
+        f"Before you confirm:\n{points}{seen_to}"
     )
 
 

@@ -116,6 +116,7 @@ def vocabulary() -> Iterator[Text]:
     from tdhil.service.page_routes import AS_RIG
     from tdhil.service.run_state import State
     from tdhil.service.start_request import LIMIT_TEXTS
+    from tdhil.session.confirm import CHECKLIST
 
     options = "tdhil/config/options.py"
     forms = ("run", "acquire", "simulated", "real", "rehearsal", "replay", "trace", "upload", "motion", "motion-file",
@@ -145,6 +146,8 @@ def vocabulary() -> Iterator[Text]:
         yield Text("tdhil/runner/task.py", "outcome", outcome)
     for verdict in (*(one.value for one in Verdict), "pass", "fail", "cannot tell", "inconclusive"):
         yield Text("tdhil/estimation/result.py", "verdict", verdict)
+    for point in CHECKLIST:
+        yield Text("tdhil/session/confirm.py", "check", point)
     for reaction in REACTIONS.values():
         yield Text("drivers/drive.py", "reaction", reaction)
     for mode in ("torque", "speed"):

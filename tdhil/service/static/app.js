@@ -733,7 +733,8 @@
         const box = el("input", { type: "checkbox" });
         box.addEventListener("change", ready);
         boxes.push(box);
-        return [el("label", { class: "check" }, box, ` ${found[1]}`)];
+        const meant = word(found[1], "check");         // the English text is bound to the code
+        return [el("label", { class: "check" }, box, " ", english(found[1]), meant === found[1] ? "" : el("span", { class: "dim" }, ` – ${meant}`))];
       }));
       byId("confirm-tick").hidden = !boxes.length;
       ready();
