@@ -329,7 +329,7 @@ class RunOptions:
         le=1e7,
         unset="what remains of `limits.time_s`", form=Form(
             "Longest duration of stage 5, minutes", unit=MINUTE,
-            hint="as planned; with a tolerance, as the limits allow"),
+            hint="by plan or limits"),
         help="longest duration of stage 5, such as 300 or 5min (default: its planned duration; with a tolerance, what "
         "remains of limits.time_s)",
         more="(on the command line `5min` too); longest duration of stage 5. Without a tolerance: its planned duration",

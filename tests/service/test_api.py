@@ -861,7 +861,7 @@ def test_a_form_has_the_fields_of_the_table(client, path, fields):
 def test_the_form_asks_for_minutes_and_per_cent(client):
     page = client.get("/start/a").text
     assert re.search(r'name="tolerance" placeholder="default: 5"[^>]*data-unit="%"', page)
-    assert re.search(r'name="max_time_s" placeholder="as planned; [^"]*"[^>]*data-unit="min"', page)
+    assert re.search(r'name="max_time_s" placeholder="by plan or limits"[^>]*data-unit="min"', page)
 
 
 def test_an_empty_field_of_the_start_form_shows_the_value_of_the_rig_s_file(client, rigs):
