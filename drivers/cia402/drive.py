@@ -425,7 +425,7 @@ class Cia402Drive:
             # sent. In stepped time the cycle is still started, because it advances time.
             fed = power.fed
             if fed:
-                self._standing.push(reported.state, power.wish)
+                self._standing.push(reported.state, power.wish, removes_torque=power.removes_torque)
             return self._judge(now_s, bus.receive(now_s, fed or self.clock.stepped))
         mode = self._mode
         mode.cycles += 1
@@ -595,7 +595,8 @@ class Cia402Drive:
     def _push(self) -> bool:
         """Write the controlword towards the request as an object. Return False if the reported state needs none."""
         ready, power = self._prepared, self._power
-        return push(self._bus.objects, self._reported.state, power.wish, ready.watchdog_s, ready.content.offset)
+        return push(self._bus.objects, self._reported.state, power.wish, ready.watchdog_s, ready.content.offset,
+                    removes_torque=power.removes_torque)
 
     def read_position(self) -> PositionReading | None:
         """Read the motor's angle as an object between two cycles; None if the drive has none or did not answer in

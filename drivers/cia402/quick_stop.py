@@ -17,6 +17,7 @@ from drivers.cia402.position import find_angle
 from drivers.cia402.preflight import read_identity, speed_unit
 from drivers.cia402.process_data import TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL
 from drivers.cia402.state_machine import (
+    DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     QUICK_STOP,
     TARGET_REACHED,
@@ -85,10 +86,10 @@ class Standing:
         wait_s = 2.0 * self._period_s if others else self._patience_s
         return not self.by_object and now_s - self._since_s >= wait_s - 1e-9
 
-    def push(self, state: State, wish: PowerRequest) -> None:
+    def push(self, state: State, wish: PowerRequest, *, removes_torque: bool = False) -> None:
         """Send one write request per cycle towards ``wish``: the controlword, and setpoints of zero in between.
 
-        A torque offset is cleared first, in any state.
+        A torque offset is cleared first, in any state. ``removes_torque``: the power stage is switched off at once.
         """
         if self.offset is not None and self._turn == 0:
             self._turn = 1
@@ -106,7 +107,8 @@ class Standing:
             index, sub, _ = self.offset or (0x6071, 0, 16)
             self._put(index, sub, bytes(2))
         else:
-            self._put(0x6040, 0, controlword_towards(state, wish).to_bytes(2, "little"))
+            word = DISABLE_VOLTAGE if removes_torque else controlword_towards(state, wish)
+            self._put(0x6040, 0, word.to_bytes(2, "little"))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -147,9 +149,19 @@ class Cia402Target:
             self.enforce(attempt)
         except (CommunicationLost, ObjectRefused, DriveFault) as error:
             failed = error
-        self._objects.write(_CONTROLWORD, 0, self._word, 16)
+        self._objects.write(_CONTROLWORD, 0, self._word_now(), 16)
         if failed is not None:
             raise failed
+
+    def _word_now(self) -> int:
+        """Return the controlword. The halt bit acts in operation only, and its word would enable any other drive."""
+        if self._word == QUICK_STOP:
+            return QUICK_STOP
+        try:
+            enabled = decode(self._objects.read(0x6041)) is State.OPERATION_ENABLED
+        except (CommunicationLost, ObjectRefused):
+            enabled = False
+        return self._word if enabled else QUICK_STOP
 
     def enforce(self, attempt: int) -> None:
         """Use a stronger means of the bus than an object, from some attempt on. May raise DriveFault."""

@@ -161,7 +161,8 @@ class DriveWatch:
         elif code and self.expect_operational:
             extra = f" (manufacturer's bytes {data[3:].hex(' ')})" if any(data[3:]) else ""
             kind = SensorFault if code >> 8 == _SENSOR else DriveFault
-            self.keep("emcy", kind(
+            # a drive may report its trip first: the sensor's message must not get lost behind it
+            self.keep("emcy, sensor" if kind is SensorFault else "emcy", kind(
                 emcy_text(code) + extra, where=self.place,
                 next_step="See the drive's fault list, remove the cause, then start with --reset-fault",
             ))

@@ -143,6 +143,7 @@ class ModbusDrive:
         self._shown: Mode | None = None
         self._sent_mode = Mode.SPEED
         self._since_mode_sent = self._since_mode_read = 0
+        self._writes_mode = False
         self._failing_since_s: float | None = None
         self._told_loss = self._told_other = False
         self._out_of_operation = 0     # cycles without operation since this run last requested it
@@ -342,13 +343,7 @@ class ModbusDrive:
         self._poll_other_masters()
         if self._wish is PowerRequest.ENABLED:
             self._heat.poll(self._timeout_s)
-        turning = not self._standstill.near(self._feedback.speed_rad_s)
-        # A drive that was enabled and shows no valid state is not disabled: it is braked at any reported speed.
-        unknown = self._ever_enabled and power_state(self._state) is PowerState.UNKNOWN
-        word = controlword_towards(
-            self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse,
-            turning=(turning or unknown) and not self._removes_torque,
-        )
+        word = self._word(command.mode)
         image = self._codec.image(word, setpoints, command.mode)
         self._unless_frozen(self._ticks.check)
         self._other.sent(image)
@@ -368,6 +363,8 @@ class ModbusDrive:
             return self._sample(begun_s, self.clock.now_s() - begun_s, 0.0, fresh=False)
         self._ticks.done()
         self._failing_since_s, self._told_loss = None, False
+        if self._writes_mode:          # known only now: a round that failed may have written no mode
+            self._sent_mode, self._since_mode_sent = command.mode, 0
         self._take(self._codec.feedback(got.words), command.mode)
         if self._other.seen and self._wish is not PowerRequest.ENABLED:
             got = self._insist(got, setpoints, command.mode, begun_s)
@@ -392,16 +389,23 @@ class ModbusDrive:
                 self._ticks.done()
                 raise
 
+    def _word(self, mode: Mode) -> int:
+        """Return the control word towards the present request."""
+        turning = not self._standstill.near(self._feedback.speed_rad_s)
+        # A drive that was enabled and shows no valid state is not disabled: it is braked at any reported speed.
+        unknown = self._ever_enabled and power_state(self._state) is PowerState.UNKNOWN
+        return controlword_towards(
+            self._profile.control, self._state, self._wish, mode, reverse=self._reverse,
+            turning=(turning or unknown) and not self._removes_torque,
+        )
+
     def _insist(self, got: Round, setpoints: Setpoints, mode: Mode, begun_s: float) -> Round:
         """Repeat the words of the stop against another master, as often as the period permits."""
         until_s = begun_s + INSIST_SHARE * self.period_s
         self._press_speed_limits(begun_s)
         took_s = 0.0
         while (sent_s := self.clock.now_s()) + took_s < until_s:
-            turning = not self._standstill.near(self._feedback.speed_rad_s)
-            word = controlword_towards(
-                self._profile.control, self._state, self._wish, mode, reverse=self._reverse, turning=turning
-            )
+            word = self._word(mode)
             try:
                 got = go_round(
                     self._access, self._plan.cycle, self._codec.image(word, setpoints, mode), self._timeout_s,
@@ -511,10 +515,11 @@ class ModbusDrive:
         self._since_mode_sent += 1
         self._since_mode_read += 1
         repeat = self._shown is not mode and self._since_mode_sent >= REPEAT_MODE_CYCLES
-        if plan.mode_writes and (mode is not self._sent_mode or repeat):
-            self._since_mode_sent = 0
+        self._writes_mode = bool(plan.mode_writes) and (mode is not self._sent_mode or repeat)
+        if self._writes_mode:
             found += plan.mode_writes
-        self._sent_mode = mode
+        elif not plan.mode_writes:
+            self._sent_mode = mode
         if plan.mode_reads and (self._shown is not mode or self._since_mode_read >= READ_MODE_CYCLES):
             self._since_mode_read = 0
             found += plan.mode_reads

@@ -201,7 +201,11 @@ class RtuLink:
         return second, self.clock.now_s()
 
     def _come_into_step(self) -> None:
-        """Discard late data, and wait for a reply that may still come."""
+        """Discard late data, and wait for a reply that may still come.
+
+        On a line that is never quiet the wait ends too: a request that may collide is better than a stop that is never
+        sent.
+        """
         try:
             late = bool(self._port.in_waiting)
         except Exception as error:      # any type of error, as in `transact`
@@ -209,8 +213,9 @@ class RtuLink:
         if not late and not self._listen_s:
             return
         until_s = self.clock.now_s() + self._listen_s
+        give_up_s = until_s + LONGEST_LISTEN_S
         heard_s = self.clock.now_s() if late else None
-        while heard_s is not None or self.clock.now_s() < until_s:
+        while (heard_s is not None or self.clock.now_s() < until_s) and self.clock.now_s() < give_up_s:
             if self._read():
                 late, heard_s = True, self.clock.now_s()
             elif heard_s is not None and self.clock.now_s() - heard_s >= QUIET_S:

@@ -98,6 +98,10 @@ class Standstill:
             and observer.reports_trusted
         )
 
+    def restart(self) -> None:
+        """Discard the standstill seen so far."""
+        self._since_s = None
+
     def see(self, sample: Sample, polled_gap_s: float = 0.0, *, without_torque: bool = False) -> bool:
         """Add one sample. Return True once the shaft has been at standstill for long enough.
 

@@ -287,10 +287,10 @@ class StopSequence:
         self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
         self._trapped_nm = self._held_at_rest_nm = 0.0
         self._position_due_s = self._position_read_s = self._repeat_due_s = -math.inf
-        self._torque_removed = self._stayed_in_torque_mode = False
+        self._torque_removed = self._stayed_in_torque_mode = self._disagreed = False
         self._trouble: list[str] = []
         self._polls = FeedbackPolls(loop.drive, loop.period_s)
-        self._slowing = Slowing(self._at_rest_rad_s)
+        self._slowing = Slowing(self._at_rest_rad_s, max(SLOWING_S, UNMOVED_RAMP_SHARE * ramp_s))
         self._unmoved_s = max(
             UNMOVED_STRING_S if self._string is not None else UNMOVED_S, UNMOVED_RAMP_SHARE * ramp_s
         )
@@ -520,6 +520,8 @@ class StopSequence:
             return None
         if string is not None and self._speed_doubted:     # `_run_out` has tried it
             return None
+        if self._silent >= self._loop.cycles(MODE_S):      # no feedback shows the mode; the quick stop's polls may
+            return None
         self._stayed_in_torque_mode = True
         self._trouble.append(
             f"the drive stayed in torque mode: it did not confirm speed mode within {MODE_S:.1f} s. Its profile does"
@@ -543,6 +545,8 @@ class StopSequence:
         return not self._in_torque_mode
 
     def _decelerate(self) -> float | None:
+        # silence before the quick stop says nothing of the drive's answers to polls, which begin with it
+        self._silent = 0
         asked = self._ask(self._loop.drive.quick_stop)
         at_rest_s = self._see_rest(asked)
         if at_rest_s is None and self._silent < self._enough_silent and self._contradicted():
@@ -665,9 +669,12 @@ class StopSequence:
             return True
         if sample is None or rest.quiet(sample):
             return True
-        self._trouble.append(
-            f"the cycle reports standstill, a single request {sample.speed_rad_s:.3f} rad/s: the drive was not disabled"
-        )
+        rest.restart()                 # asked again after as long a standstill, not in each cycle
+        if not self._disagreed:
+            self._trouble.append(
+                f"the cycle reports standstill, a single request {sample.speed_rad_s:.3f} rad/s: the drive is not"
+                " disabled before both agree")
+        self._disagreed = True
         return False
 
     def _removes_torque(self, sample: Sample) -> bool:
@@ -678,10 +685,11 @@ class StopSequence:
         how = self._loop.guard.observer.runs_away(sample)
         if not how:
             return False
-        self._trouble.append(
-            f"torque removed: the shaft accelerates against the quick stop ({how}). It runs out without a brake"
-        )
-        self._remove_torque()
+        why = f"the shaft accelerates against the quick stop ({how})"
+        if self._remove_torque():
+            self._trouble.append(f"torque removed: {why}. It runs out without a brake")
+        else:
+            self._trouble.append(f"{why}, and the drive does not confirm that its torque is off")
         return True
 
     def _remove_torque(self, command: Command = _REST) -> bool:

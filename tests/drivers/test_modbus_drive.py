@@ -9,7 +9,7 @@ from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
-from drivers.modbus.pdu import CycleRefused, LinkLost, NoisyReply
+from drivers.modbus.pdu import CycleRefused, LinkLost, NoisyReply, NoReply
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, MODE, SPEED, STATUS, Bank, high_and_low
@@ -349,6 +349,26 @@ def test_what_could_not_be_given_back_is_said():
     assert len(left) == 1
     assert "register 38" in left[0]
     assert run.bank.words[40] == 0
+
+
+@pytest.mark.parametrize("display", [True, False])
+def test_a_mode_that_was_lost_with_its_cycle_is_written_again_in_the_next_one(display):
+    shown = {"register": {"address": 9}, "speed": 0, "torque": 1} if display else None
+    apart = profile_with(modes={"register": {"address": 8, "type": "u16"}, "display": shown})
+    bank = Bank()
+    bank.on_show = lambda words: words.update({9: words[8]})
+    run = Run(apart, bank).enabled()
+    good = run.link.transact
+
+    def lost(unit, pdu, timeout_s):
+        raise NoReply("no reply in time")
+
+    run.link.transact = lost
+    assert run.cycle(1.0, 120.0, Mode.TORQUE).mode is Mode.SPEED
+    run.link.transact = good
+    bank.writes.clear()
+    assert run.cycle(1.0, 120.0, Mode.TORQUE).mode is Mode.TORQUE
+    assert [words for address, words in bank.writes if address == 8] == [[1]]
 
 
 def test_mode_in_a_register_of_its_own_comes_after_the_seed():

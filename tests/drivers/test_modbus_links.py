@@ -576,3 +576,32 @@ def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
         with pytest.raises(LinkLost):  # and it is given up in the end
             link.transact(1, ASK, 0.02)
         link.close()
+
+
+class Babble:
+    """A serial port on a line that is never quiet: another device transmits without a pause."""
+
+    in_waiting = 1
+
+    def __init__(self, clock):
+        self.clock = clock
+        self.written = []
+
+    def read(self, _count):
+        self.clock.skipped_s += 0.005
+        return b"\x55"
+
+    def write(self, data):
+        self.written.append(data)
+
+
+def test_a_line_that_is_never_quiet_does_not_hold_a_request_back():
+    with Line("rtu", lambda request: b"") as line:
+        port, line.link._port = line.link._port, Babble(line.clock)
+        begun_s = line.clock.now_s()
+        for count in (1, 2):
+            with pytest.raises(BadReply):
+                line.ask(SHORT_S)
+            assert len(line.link._port.written) == count
+        assert line.clock.now_s() - begun_s < 2.0
+        line.link._port = port

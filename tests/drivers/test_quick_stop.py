@@ -120,6 +120,17 @@ def test_a_quick_stop_that_is_set_to_coast_is_set_otherwise_or_the_halt_bit_stan
     assert ("the halt bit was used instead" if refused else "605Ah was changed from 0 to 6") in said
 
 
+@pytest.mark.parametrize("state", ["switched on", "ready to switch on", "switch on disabled"])
+def test_the_halt_bit_enables_no_drive(wire, scripted, state):
+    """010Fh takes a drive that is switched on to operation enabled (CiA 402, transition 4)."""
+    scripted.machine.state = state
+    scripted.objects[0x605A, 0] = u(0, 2)
+    scripted.refuse_write[0x605A, 0] = 0x06010002
+    target_of(wire).ask(1)
+    assert order(scripted)[-1] == (0x6040, 0x0002)
+    assert scripted.machine.state != "operation enabled"
+
+
 def test_what_undoes_it_gets_it_by_rpdo_too_and_is_switched_off_in_the_end(wire, scripted):
     """6040h behind a byte of something else in RPDO2; RPDO1 is off, RPDO3 carries no controlword."""
     scripted.objects |= {

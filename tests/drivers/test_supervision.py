@@ -5,7 +5,7 @@ import pytest
 from drivers.canopen.supervision import NodeWatch
 from drivers.cia402.supervision import emcy_text
 from drivers.clock import SteppedClock
-from drivers.errors import CommunicationLost, DriveFault
+from drivers.errors import CommunicationLost, DriveFault, SensorFault
 
 OPERATIONAL = b"\x05"
 
@@ -145,3 +145,13 @@ def test_manufacturers_bytes_are_shown(watch):
 def test_emcy_text(code, text):
     assert emcy_text(code).startswith(f"EMCY {code:04X}h, ")
     assert text in emcy_text(code)
+
+
+@pytest.mark.parametrize("first", ["8084110000000000", "0573810000000000"])
+def test_a_sensor_s_message_is_not_lost_beside_another_one(watch, first):
+    """A drive with a broken encoder may report its following error (8480h) first, then the sensor (7305h)."""
+    for data in (first, "8084110000000000", "0573810000000000"):
+        watch.on_emcy(bytes.fromhex(data))
+    kinds = {type(raised_by(watch)), type(raised_by(watch))}
+    assert kinds == {DriveFault, SensorFault}
+    assert raised_by(watch) is None

@@ -7,8 +7,19 @@ import pytest
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost
 from tdhil.runner.settings import ControlAssumptions
-from tdhil.runner.stop import AFTER_S, EVERY_S, REST_AFTER_S, SILENT_S, SLOWING_S, UNMOVED_S, FeedbackPolls, Slowing
+from tdhil.runner.stop import (
+    AFTER_S,
+    EVERY_S,
+    MODE_S,
+    REST_AFTER_S,
+    SILENT_S,
+    SLOWING_S,
+    UNMOVED_S,
+    FeedbackPolls,
+    Slowing,
+)
 from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive
+from tests.runner.string_drive import StringDrive, StringWorld
 
 SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
 
@@ -60,6 +71,60 @@ def test_without_feedback_looks_confirm_it(world, gone, speed):
     # Ramp, settling, disabling and settling again, and the looks no closer together than said.
     took_s = speed / 2.0 + 2.0 * SETTLE_S
     assert here.drive.looks <= took_s / EVERY_S + 10
+
+
+def test_without_feedback_in_torque_mode_the_quick_stop_comes_and_looks_confirm_it(world):
+    """A profile that does not state that a quick stop brakes in torque mode: nothing shows the mode now."""
+    here = world(LookedAt(quick_stop_in_torque_mode=False))
+    here.turn(3.0, Mode.TORQUE)
+    here.drive.gone = "missing"
+    begun_s = here.bench.now_s
+    asked_s = []
+    here.drive.quick_stop = lambda stop=here.drive.quick_stop: (asked_s.append(here.bench.now_s), stop())
+    report = here.stop_sequence().run()
+    assert report.confirmed and report.disabled and here.drive.looks > 10
+    assert asked_s[0] - begun_s < MODE_S + 0.1
+    assert not report.stayed_in_torque_mode
+
+
+@pytest.mark.parametrize("mode", [Mode.SPEED, Mode.TORQUE])
+def test_without_feedback_above_a_string_looks_confirm_the_quick_stop(mode):
+    class Looked(StringDrive):
+        def poll(self):
+            self.looks = getattr(self, "looks", 0) + 1
+            return self.report()
+
+    here = StringWorld(speed=3.0, mode=mode)
+    here.drive.__class__ = Looked
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=False)
+    report = here.stop_sequence().run()
+    assert here.drive.looks > 10
+    assert report.at_rest_s is not None, report.trouble
+
+
+def test_a_shaft_that_brakes_on_a_slow_ramp_is_not_left_to_the_watchdog(world):
+    """150 rad/s at 2 rad/s²: in one second the speed falls by 1.3 %."""
+    here = world(LookedAt(viscous=0.0), replace(LIMITS, speed_max_rad_s=160.0, quick_stop_rad_s2=2.0))
+    here.turn(150.0)
+    here.drive.gone = "missing"
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+
+
+def test_a_poll_that_contradicts_the_cycle_is_repeated_after_a_standstill_and_told_once(world):
+    @dataclass
+    class Stuck(LookedAt):
+        def poll(self):
+            self.looks += 1
+            return self.report()._replace(speed_rad_s=1.0)
+
+    here = world(Stuck())
+    here.turn(0.0)
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert here.drive.looks <= (here.bench.now_s - begun_s) / SETTLE_S + 2
+    assert sum("a single request" in line for line in report.trouble) == 1
 
 
 def test_a_polled_speed_of_zero_that_the_angle_contradicts_is_no_rest(world):
