@@ -203,6 +203,8 @@ class Check:
     next_step: str = ""
 
 
+NOT_RESTORED: Final = "it is not confirmed that the drive is disabled, so the former value was not restored"
+"""Why `Drive.close` left a setting of this run in the drive."""
 REACTIONS: Final = {
     "quick_stop": "quick stop", "ramp_stop": "stop on the ramp", "fault_reaction": "fault reaction of the drive",
     "coast": "torque off, the shaft coasts", "none": "NONE, the drive does not stop by itself",

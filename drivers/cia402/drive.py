@@ -48,6 +48,7 @@ from drivers.clock import RATES_HZ, STALL_CYCLES, STALL_S, Ticks, how_late
 from drivers.drive import (
     LEAST_CYCLES,
     LOCAL_CYCLES,
+    NOT_RESTORED,
     REPEAT_MODE_CYCLES,
     Command,
     Counters,
@@ -656,6 +657,8 @@ class Cia402Drive:
             if self._taken and disabled:
                 self._bus.release()
                 left = self._bus.objects.restore()
+            elif self._taken:
+                left = tuple(f"{one}: {NOT_RESTORED}" for one in self._bus.objects.changed)
         except (CommunicationLost, DriveFault) as error:
             left = (str(error),)
         finally:

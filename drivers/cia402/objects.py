@@ -103,6 +103,11 @@ class Objects(ABC):
         """Register ``undo``, which `restore` calls."""
         self._undo.append(undo)
 
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Return the names of the objects that `restore` would give back."""
+        return tuple(name(*one) for one in sorted(self._changed))
+
     def restore(self) -> tuple[str, ...]:
         """Undo every change, the last one first. Return the changes that could not be restored."""
         failed = []
@@ -113,7 +118,7 @@ class Objects(ABC):
             except ObjectRefused as error:
                 failed.append(str(error))
             except CommunicationLost as error:
-                failed.append(str(error))
+                failed.append(f"{error} ({len(self._undo)} more settings were not restored)")
                 self._undo.clear()
         return tuple(failed)
 

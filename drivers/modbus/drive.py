@@ -19,6 +19,7 @@ from drivers.angle import Unwrapped
 from drivers.clock import Ticks
 from drivers.drive import (
     LOCAL_CYCLES,
+    NOT_RESTORED,
     REPEAT_MODE_CYCLES,
     Command,
     Counters,
@@ -662,10 +663,7 @@ class ModbusDrive:
                     clear_setpoints(PreflightTable(), self._access, self._profile, self._off_word())
                 left = self._access.restore()
             else:
-                left = tuple(
-                    f"{where}: it is not confirmed that the drive is disabled, so the former value was not restored"
-                    for where in self._access.changed
-                )
+                left = tuple(f"{where}: {NOT_RESTORED}" for where in self._access.changed)
         except CommunicationLost as error:
             left = (str(error),)
         finally:

@@ -331,7 +331,8 @@ def test_settings_are_given_back(run):
 def test_a_drive_that_may_still_turn_keeps_its_watchdog(run):
     run.turning(2.0, for_s=2.0)
     armed = run.bench.settings((run.bench.WATCHDOG,))
-    run.drive.close()
+    left = run.drive.close()
+    assert left and all("was not restored" in line for line in left)       # each setting that stays is named
     assert run.bench.settings((run.bench.WATCHDOG,)) == armed
     assert set(armed.values()) != {0}
 
