@@ -457,3 +457,25 @@ def test_a_damaged_reply_is_asked_for_once_more_within_the_cycle(damaged, missed
     before = run.drive.counters.missed
     assert run.cycle().fresh is (missed == 0)
     assert run.drive.counters.missed - before == missed
+
+
+def test_removing_the_torque_sends_the_word_that_lets_the_shaft_coast():
+    """`off` is a ramp on some drives: under it a shaft that accelerates against its quick stop goes on."""
+    run = Run(profile_with(control={"coast": 0x0005})).enabled()
+    run.drive.quick_stop()
+    run.cycle()
+    run.drive.remove_torque()
+    for _ in range(3):
+        run.cycle()
+    assert run.controlwords()[-3:] == [0x0005] * 3
+
+
+OFF2, NO_COASTING = 0x0002, 0x0008      # PROFIdrive and the FC profile: 0 in this bit lets the shaft coast
+
+
+@pytest.mark.parametrize(("name", "bit"), [
+    ("siemens/g120", OFF2), ("siemens/g130-s120", OFF2), ("danfoss/fc302", NO_COASTING),
+])
+def test_a_profile_whose_off_is_a_ramp_has_a_word_to_coast(name, bit):
+    control = load_modbus_profile(name).control
+    assert control.off & bit and control.coast is not None and control.coast == control.off & ~bit
