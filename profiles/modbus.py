@@ -88,8 +88,8 @@ class Control(ProfileEntry):
     states: tuple[StatusState, ...] = Field(min_length=3)
     off: Word = Field(description="disables the drive at standstill")
     coast: Word | None = Field(
-        default=None, description="switches the torque off at once, for a shaft that accelerates against its quick stop;"
-        " null: `off` does"
+        default=None, description="switches the torque off at once, for a shaft that accelerates against its quick"
+        " stop; null: `off` does"
     )
     quick_stop: Word = Field(description="brakes to standstill, under the drive's own speed control")
     fault_reset: tuple[Word, ...] = Field(min_length=1, description="words sent one after the other to reset a fault")

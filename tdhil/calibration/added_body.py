@@ -228,9 +228,18 @@ class _FittedLine:
 _ROUNDS = 10
 
 
+def _of_bodies(case: CalibrationCase) -> FloatArray:
+    """Return the covariance of the bodies' inertias, (n, n), (kg·m²)².
+
+    Runs with the same inertia and uncertainty have the same body: its error does not average out over them.
+    """
+    stated = [(run.added_kg_m2, run.added_sd_kg_m2) for run in case.runs]
+    return np.array([[one[1] * other[1] if one == other else 0.0 for other in stated] for one in stated])
+
+
 def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
     design = np.column_stack([np.ones_like(added), added])
-    bodies = np.diag([run.added_sd_kg_m2**2 for run in case.runs])
+    bodies = _of_bodies(case)
     slope = 1.0
     for _ in range(_ROUNDS):
         whole = case.covariance + slope**2 * bodies
@@ -270,14 +279,15 @@ def _propagated(
     shared = [math.sqrt(max(float(one @ rest @ one), 0.0)) for one in both]
     scale = math.sqrt(max(float(np.trace(rest)) / len(case.runs), 0.0))
     lines.append(CalibrationLine("filters of the reports", scale, "Student", case.degrees_of_freedom, *shared))
-    for k, run in enumerate(case.runs):
-        if run.added_sd_kg_m2 > 0.0:
-            shares = (abs(float(one)) * slope * run.added_sd_kg_m2 for one in both[:, k])
-            lines.append(CalibrationLine(f"body of {run.name}", run.added_sd_kg_m2, "normal", CERTAIN, *shares))
-    found = []
-    body = slope * np.array([run.added_sd_kg_m2 for run in case.runs])
+    for added, sd in dict.fromkeys((run.added_kg_m2, run.added_sd_kg_m2) for run in case.runs):
+        if sd > 0.0:
+            has = [(run.added_kg_m2, run.added_sd_kg_m2) == (added, sd) for run in case.runs]
+            names = ", ".join(run.name for run, one in zip(case.runs, has, strict=True) if one)
+            shares = (abs(float(np.sum(one[has]))) * slope * sd for one in both)
+            lines.append(CalibrationLine(f"body of {names}", sd, "normal", CERTAIN, *shares))
+    found, of_bodies = [], slope**2 * _of_bodies(case)
     for value, row in ((factor, both[0]), (inertia, both[1])):
-        runs, bodies = float(row @ case.covariance @ row), float(np.sum((row * body) ** 2))
+        runs, bodies = float(row @ case.covariance @ row), float(row @ of_bodies @ row)
         variance = runs + bodies
         dof = effective_degrees_of_freedom(((math.sqrt(runs), case.degrees_of_freedom), (math.sqrt(bodies), CERTAIN)))
         found.append(measured_value(float(value), math.sqrt(variance) * abs(float(value)), dof, case.confidence))

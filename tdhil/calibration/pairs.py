@@ -12,6 +12,9 @@ than stated, the errors are multiplied by √(χ²/(n − 2)) and have n − 2 d
 **Hysteresis.** Readings with rising and with falling torque differ if there is friction between the sensor and the
 shaft. The mean of R − line over each direction is reported. Half of their difference is the half-width h of a
 rectangular error that both directions share: it adds h/√3 over the mean torque to the relative uncertainty of κ.
+
+**Scale of the reference.** All pairs share the sensor's error of scale, which no number of pairs averages out (GUM
+F.1.2.3). It is a line of its own, so the uncertainty of a pair is that of its reading.
 """
 
 import math
@@ -19,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from profiles.quantities import printed_share
 from tdhil.calibration.added_body import (
     CONTRADICTED_P,
     LARGEST_ERROR,
@@ -27,7 +31,8 @@ from tdhil.calibration.added_body import (
     effective_degrees_of_freedom,
     measured_value,
 )
-from tdhil.estimation import ResidualTest
+from tdhil.calibration.reference import ASSUMED_REFERENCE_REL_SD
+from tdhil.estimation import ResidualTest, normal_quantile
 from tdhil.estimation.frequency_domain import CERTAIN
 from tdhil.recording import FloatArray
 
@@ -53,8 +58,8 @@ class PairsFit:
     N·m.
 
     ``hysteresis_nm``: reading with rising torque less reading with falling torque, about the line; None with one
-    direction. ``refusal``: reason why the factor is unusable, '' if it is usable. ``spread``: √(χ²/(n − 2)) if above 1,
-    else 1.
+    direction. ``refusal``: reason why the factor is unusable, '' if it is usable; ``too_wide``: because its interval is
+    wider than that of the stated torque scale. ``spread``: √(χ²/(n − 2)) if above 1, else 1.
     """
 
     factor: MeasuredValue
@@ -66,6 +71,7 @@ class PairsFit:
     hysteresis_nm: float | None
     refusal: str = ""
     budget: tuple[FactorLine, ...] = ()
+    too_wide: bool = False
 
 
 def line_with_errors_in_both(
@@ -93,8 +99,15 @@ def line_with_errors_in_both(
     return slope, intercept, covariance, float(weight @ (y - slope * x - intercept) ** 2)
 
 
-def calibrate_pairs(pairs: TorquePairs, confidence: float = 0.95) -> PairsFit:
-    """Return κ from pairs of reference and reported torque. Raises ValueError for too few pairs."""
+def calibrate_pairs(
+    pairs: TorquePairs, confidence: float = 0.95, *, reference_rel_sd: float = ASSUMED_REFERENCE_REL_SD,
+    scale_rel_sd: float = 0.02,
+) -> PairsFit:
+    """Return κ from pairs of reference and reported torque. Raises ValueError for too few pairs.
+
+    ``reference_rel_sd``: standard uncertainty of the sensor's scale; ``scale_rel_sd``: stated for the torque scale
+    before this calibration.
+    """
     from scipy.special import chdtrc
 
     slope, intercept, covariance, chi2 = line_with_errors_in_both(
@@ -110,22 +123,27 @@ def calibrate_pairs(pairs: TorquePairs, confidence: float = 0.95) -> PairsFit:
     dof = float(more) if spread > 1.0 else CERTAIN
     size = float(np.sqrt(np.mean(pairs.reported_nm**2)))
     of_hysteresis = abs(hysteresis or 0.0) / 2.0 / math.sqrt(3.0) / size
-    factor_sd = math.hypot(math.sqrt(covariance[0, 0]), of_hysteresis)
+    factor_sd = math.hypot(math.sqrt(covariance[0, 0]), of_hysteresis, reference_rel_sd * abs(slope))
     statistic = ResidualTest(chi2, float(more), float(chdtrc(more, chi2)))
     budget = [FactorLine("scatter of the pairs" if spread > 1.0 else "stated uncertainty of the pairs",
                          "Student" if spread > 1.0 else "normal", dof, math.sqrt(covariance[0, 0]) / abs(slope))]
     if hysteresis is not None:
         budget.append(FactorLine("hysteresis", "rectangular", CERTAIN, of_hysteresis / abs(slope)))
+    budget.append(FactorLine("scale of the reference", "normal", CERTAIN, reference_rel_sd))
     effective = effective_degrees_of_freedom([(line.of_factor, line.degrees_of_freedom) for line in budget])
     factor = measured_value(slope, factor_sd, effective, confidence)
-    refusal = ""
-    if not abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
+    refusal, assumed = "", normal_quantile(confidence) * scale_rel_sd
+    too_wide = not factor.half_width_share <= assumed
+    if too_wide and abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
+        refusal = (f"the pairs leave κ at {printed_share(factor.half_width_share)}, and the stated torque scale leaves"
+                   f" ±{100 * assumed:.1f} %: measure larger torques, or more pairs")
+    elif not abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
         refusal = (f"the calibration factor would be {slope:.3g}: more than {100 * LARGEST_ERROR:.0f} % from 1 is no "
                    "error of a torque scale; check units, signs, and the shaft that the reference stands at")
     elif statistic.p_value < CONTRADICTED_P and abs(hysteresis or 0.0) < float(np.std(left)) and _bent(pairs, left):
         refusal = "the reference torque is no straight line over the reported one: its residuals are curved"
     return PairsFit(factor, measured_value(intercept, math.sqrt(covariance[1, 1]), dof, confidence), covariance, left,
-                    statistic, spread, hysteresis, refusal, tuple(budget))
+                    statistic, spread, hysteresis, refusal, tuple(budget), too_wide)
 
 
 def _bent(pairs: TorquePairs, left: FloatArray) -> bool:

@@ -47,6 +47,8 @@ LEAST_CORRELATION = 0.9
 LEAST_SWING_COUNTS = 20.0
 """Smallest swing of either torque, as a multiple of its own noise in the average or of its own count."""
 ASSUMED_REFERENCE_REL_SD = 0.003
+ASSUMED_REFERENCE = (f"the standard uncertainty of the sensor's scale was assumed to be "
+                     f"{100 * ASSUMED_REFERENCE_REL_SD:.1f} % (accuracy class 0.5); state it with --reference-sd")
 """Standard uncertainty of a sensor's scale if none is stated: accuracy class 0.5, rectangular (0.5 %/√3)."""
 LEAST_OWN_SHARE = 0.1
 """Least share of the torque's variance that its derivatives do not explain. A tone has none, steps have nearly all."""

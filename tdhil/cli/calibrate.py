@@ -93,7 +93,8 @@ def run_torque(namespace: argparse.Namespace) -> int:
         return run_without_body(namespace, confidence)
     for name in ("column", "reference_sd"):
         if getattr(namespace, name) is not None:
-            raise UsageError("needs --reference, the record of a sensor", where=f"--{name.replace('_', '-')}")
+            raise UsageError("needs the torque of a sensor: --reference, or --pairs",
+                             where=f"--{name.replace('_', '-')}")
     wanted = _wanted(namespace)
     require_new(namespace.save)
     report = ReportFile.of_files(namespace, *(path for path, _, _ in wanted))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 WITHOUT_BODY: Final = ("pairs", "reference", "known_pipe")
 """Options that replace the bodies; one at a time."""
 _BODY = ("added", "added_sd", "body")
-_NEEDS = {"column": "reference", "reference_sd": "reference"}
+_NEEDS = {"column": ("reference",), "reference_sd": ("reference", "pairs")}
 _EXAMPLES = {
     "pairs": "tdhil calibrate torque run.mcap --pairs pairs.csv --save calibration.json",
     "reference": "tdhil calibrate torque run.mcap --reference sensor.csv --save calibration.json",
@@ -38,7 +38,8 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
 
     kind, *others = [name for name in WITHOUT_BODY if getattr(namespace, name) is not None]
     unwanted = [*others, *(name for name in _BODY if getattr(namespace, name)),
-                *(name for name, needed in _NEEDS.items() if needed != kind and getattr(namespace, name) is not None)]
+                *(name for name, needed in _NEEDS.items()
+                  if kind not in needed and getattr(namespace, name) is not None)]
     for name in unwanted:
         raise UsageError(f"does not go with --{kind.replace('_', '-')}", where=f"--{name.replace('_', '-')}",
                          next_step=f"Such as: {_EXAMPLES[kind]}")
@@ -88,8 +89,10 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
                          next_step=f"Such as: {_EXAMPLES['pairs']}")
     pairs = read_pairs(namespace.pairs)
     record = _one_log(namespace, "pairs") if namespace.logs else None
+    rel_sd, warnings = _reference_sd(namespace)
+    scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:
-        found = calibrate_pairs(pairs, confidence)
+        found = calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale)
     except ValueError as error:
         raise UsageError(str(error), where=str(namespace.pairs)) from None
     drive = {} if record is None else drive_identity(record.configuration)
@@ -98,16 +101,27 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
         found, pairs, str(namespace.pairs), drive, settings, confidence=confidence,
         date=datetime.now().astimezone().isoformat(timespec="seconds"),
         simulated=record is not None and record.recording.simulated,
-        runs=() if record is None else (log_of_calibration(record),))
+        runs=() if record is None else (log_of_calibration(record),), warnings=warnings)
     return document, record
+
+
+def _reference_sd(namespace: argparse.Namespace) -> tuple[float, tuple[str, ...]]:
+    """Return the standard uncertainty of the sensor's scale, as a share, and a warning if it is assumed."""
+    from tdhil.calibration import ASSUMED_REFERENCE, ASSUMED_REFERENCE_REL_SD
+
+    stated: float | None = namespace.reference_sd
+    if stated is None:
+        return ASSUMED_REFERENCE_REL_SD, (ASSUMED_REFERENCE,)
+    if not 0.0 <= stated < 1.0:
+        raise UsageError(f"{stated:g}: must be a share from 0 to below 1", where="--reference-sd")
+    return stated, ()
 
 
 def _reference(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.report import working
     from tdhil.session import find_by_reference, require_file
 
-    if namespace.reference_sd is not None and not 0.0 <= namespace.reference_sd < 1.0:
-        raise UsageError(f"{namespace.reference_sd:g}: must be a share from 0 to below 1", where="--reference-sd")
+    _reference_sd(namespace)           # refuses a value that is no share
     record = _one_log(namespace, "reference")
     require_file(namespace.reference)
     with working("comparing both torques …"):

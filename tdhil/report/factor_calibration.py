@@ -45,11 +45,11 @@ PAIRS, REFERENCE, KNOWN_PIPE = "pairs", "reference", "known_pipe"
 
 def pairs_document(
     found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
-    simulated: bool, runs: Sequence[Part] = (),
+    simulated: bool, runs: Sequence[Part] = (), warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log."""
     return {
-        **_begun(PAIRS, "model_rejected" if found.refusal else "valid",
+        **_begun(PAIRS, "valid" if not found.refusal else "not_identifiable" if found.too_wide else "model_rejected",
                  found.refusal or (f"{len(pairs.direction)} pairs give κ to "
                                    f"{printed_share(found.factor.half_width_share)}"), ""),
         "calibration_factor": None if found.refusal else quantity(found.factor, confidence),
@@ -67,7 +67,7 @@ def pairs_document(
         ],
         "line": {"slope": found.factor.value, "intercept_nm": found.offset_nm.value,
                  "covariance": found.covariance.tolist()},
-        **_ended(source, runs, drive, settings, date, simulated, ()),
+        **_ended(source, runs, drive, settings, date, simulated, warnings),
     }
 
 

@@ -34,7 +34,7 @@ def find_by_reference(
     ``columns``: columns of the trace, as `QUANTITY=NAME:UNIT`; ``at``: the sensor's shaft. Raises UsageError and
     CsvUnusable for a trace that is not usable, NothingRecorded for a log without motion.
     """
-    from tdhil.calibration import ASSUMED_REFERENCE_REL_SD, TorqueRecord, calibrate_reference
+    from tdhil.calibration import ASSUMED_REFERENCE, ASSUMED_REFERENCE_REL_SD, TorqueRecord, calibrate_reference
     from tdhil.recording import REFERENCE_FLAG, TIME_AND_TORQUE, parse_columns, read_reference
     from tdhil.report import reference_document
 
@@ -47,8 +47,7 @@ def find_by_reference(
     rel_sd = reference_rel_sd
     if rel_sd is None:
         rel_sd = ASSUMED_REFERENCE_REL_SD
-        warnings.append(f"the standard uncertainty of the sensor's scale was assumed to be {100 * rel_sd:.1f} % "
-                        "(accuracy class 0.5); state it with --reference-sd")
+        warnings.append(ASSUMED_REFERENCE)
     good = recording.fresh
     drive = TorqueRecord(recording.time_s[good], recording.torque_nm[good] - recording.torque_offset_nm,
                          recording.torque_resolution_nm)

@@ -189,3 +189,16 @@ def test_intervals_cover_as_often_as_they_say():
         covered += [found.factor.low <= 0.96 <= found.factor.high,
                     found.inertia_kg_m2.low <= 104.0 <= found.inertia_kg_m2.high]
     assert np.all(covered > 0.935 * many) and np.all(covered < 0.965 * many)
+
+
+@pytest.mark.parametrize("runs", [1, 3, 9])
+def test_a_body_is_not_better_known_if_it_is_mounted_more_often(runs):
+    """All runs with it share its error: 1 % of the body is 1 % of κ."""
+    bodies = [0.0] * runs + [55.0] * runs
+    values = [104.0 + body for body in bodies]
+    found = calibrate_torque(case(values, bodies, noise=1e-4, sds=[0.0] * runs + [0.55] * runs))
+    assert found.factor.standard_uncertainty >= 0.01 * found.factor.value
+    of_body = [line for line in found.budget if line.source.startswith("body of")]
+    assert len(of_body) == 1 and of_body[0].of_factor == pytest.approx(0.01, rel=1e-3)
+    squares = sqrt(sum(line.of_factor**2 for line in found.budget))
+    assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)

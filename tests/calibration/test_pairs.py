@@ -104,3 +104,31 @@ def test_the_command_prints_a_card_and_a_document(tmp_path, capsys):
     assert document["calibration_factor"]["value"] == pytest.approx(0.95)
     assert main(["calibrate", "torque", "--pairs", str(path), "--added", "5"]) == 2
     assert main(["calibrate", "torque", "--pairs", str(path), "--save", str(tmp_path / "c.json")]) == 2
+
+
+@pytest.mark.parametrize("many", [8, 80])
+def test_more_pairs_do_not_average_the_scale_of_the_sensor_out(many):
+    """All pairs share the sensor, and so its error of scale (GUM F.1.2.3)."""
+    found = calibrate_pairs(pairs(np.random.default_rng(5), many=many), reference_rel_sd=0.003)
+    assert found.factor.standard_uncertainty > 0.003 * found.factor.value
+    (scale,) = (line for line in found.budget if line.source == "scale of the reference")
+    assert scale.of_factor == 0.003
+    squares = np.sqrt(sum(line.of_factor**2 for line in found.budget))
+    assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-9)
+
+
+def test_pairs_that_know_less_than_the_stated_scale_give_no_factor():
+    few = TorquePairs(np.array([0.0, 5.0, 10.0]), np.full(3, 1.0), np.array([0.0, 5.6, 11.0]), np.full(3, 0.5),
+                      ("up",) * 3)
+    found = calibrate_pairs(few)
+    assert found.too_wide and "the stated torque scale leaves ±3.9 %" in found.refusal
+    assert not calibrate_pairs(few, scale_rel_sd=0.3).too_wide
+
+
+def test_a_sensor_that_reads_too_high_within_its_class_is_covered():
+    """0.5 % is the limit of accuracy class 0.5; without the line of its scale, κ would exclude 1."""
+    rng, torque = np.random.default_rng(6), np.linspace(0.0, 200.0, 40)
+    sd = 0.2 + 0.001 * torque
+    found = calibrate_pairs(TorquePairs(torque + 0.2 * rng.standard_normal(40), np.full(40, 0.2),
+                                        1.005 * torque + sd * rng.standard_normal(40), sd, ("up",) * 40))
+    assert found.factor.low <= 1.0 <= found.factor.high
