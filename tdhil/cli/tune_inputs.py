@@ -51,6 +51,40 @@ def read_result(path: Path) -> Mapping[str, Any]:
     return document
 
 
+def calibration_factor(result: Mapping[str, Any]) -> float:
+    """Return κ of the torque calibration of a result: true torque over torque in the drive's own N·m; 1 without one."""
+    found = result.get("torque_calibration")
+    factor = found.get("factor") if isinstance(found, dict) else None
+    return float(factor) if isinstance(factor, int | float) and is_number(factor) and factor > 0.0 else 1.0
+
+
+def in_drive_torque(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the result with J, friction and response in the drive's own N·m, in which its speed controller works.
+
+    The drive knows no calibration: with T = κ T_drive, the equation J ω' = T becomes (J/κ) ω' = T_drive.
+    """
+    factor = calibration_factor(result)
+    if factor == 1.0:
+        return result
+    found = dict(result)
+    for name in ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm"):
+        found[name] = _scaled(result.get(name), 1.0 / factor)
+    if isinstance(shaft := result.get("compliant"), dict):
+        found["compliant"] = {**shaft, "damping_nm_s_rad": _scaled(shaft.get("damping_nm_s_rad"), 1.0 / factor)}
+    if isinstance(response := result.get("frequency_response"), dict):
+        found["frequency_response"] = {**response, "lines": [
+            {**line, "magnitude": _scaled(line["magnitude"], factor)} for line in response["lines"]]}
+    return found
+
+
+def _scaled(part: Any, by: float) -> Any:
+    """Return an estimate with its value and ends multiplied."""
+    if not isinstance(part, dict):
+        return part
+    ends = ("value", "low", "high", "low_total", "high_total")
+    return {key: one * by if key in ends and is_number(one) else one for key, one in part.items()}
+
+
 def inertia_to_tune_for(
     result: Mapping[str, Any], path: Path, refused: type[TdhilError], next_step: str = _IDENTIFY_J
 ) -> tuple[float, float, float]:

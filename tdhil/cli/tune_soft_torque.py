@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from tdhil.cli.report_file import ReportFile, add_head_options, add_report_optio
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
     bounded_estimate,
+    calibration_factor,
     check_inner_lags,
     check_limits,
     check_present,
@@ -148,7 +149,8 @@ def run(namespace: argparse.Namespace) -> int:
         document = tuning_document(tuning, tuned_for)
         if namespace.depths is not None:
             parameters = speed_controller_of(profile, result) if namespace.loop == "drive" else None
-            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, parameters, progress)
+            document["schedule"] = _schedule(case, namespace, tuned_for.gear_ratio, parameters,
+                                              calibration_factor(result), progress)
         if report is not None or namespace.map:
             progress("the operator's map: set speed and bit torque")
             found = operator_map(tuning)
@@ -244,7 +246,7 @@ def depths(text: str) -> tuple[float, ...]:
 
 def _schedule(
     case: TuneCase, namespace: argparse.Namespace, ratio: float, parameters: SpeedControllerParameters | None,
-    progress: Callable[[str], None],
+    factor: float, progress: Callable[[str], None],
 ) -> dict[str, Any]:
     """Return gains over depth: soft ones, which any drive accepts, or compensated ones with --compensate."""
     from tdhil.report import schedule_document
@@ -261,7 +263,7 @@ def _schedule(
     def settings(law: SpeedController) -> Sequence[DriveSetting]:
         if parameters is None:
             return ()
-        return drive_settings(parameters, law, namespace.rated_torque, namespace.rated_speed)
+        return drive_settings(parameters, _in_drive(law, factor), namespace.rated_torque, namespace.rated_speed)
 
     return schedule_document(found, ratio, settings)
 
@@ -295,12 +297,14 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * estimated(result, "viscous_nm_s_rad"),
                      square**0.5 * estimated(result, "coulomb_nm"), lags)
-    present, of_present = (None, ()) if measured is None else _present(measured, square)
+    # the gains in the drive are in its own N·m, all else is in true N·m
+    factor = calibration_factor(result)
+    present, of_present = (None, ()) if measured is None else _present(measured, factor * square)
     gains, present_from = present_gains(namespace, measured, result)
     if namespace.loop == "bus" and namespace.present is None and measured is None:
         gains, present_from = None, None         # gains that the drive reports do not act on this loop
     if gains is not None and measured is None:
-        present = SpeedController(square * gains.gain_nm_s_rad, square * gains.integral_nm_rad)
+        present = SpeedController(factor * square * gains.gain_nm_s_rad, factor * square * gains.integral_nm_rad)
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
                     namespace.compensate, present, (*found.ends, *of_lags, *of_present), found.inertia_alone_share,
                     required=_required(result, namespace), string_draws=found.draws, inertia_draws=found.inertia_draws,
@@ -496,6 +500,12 @@ def _known_pipe(drawn: Sequence[Sequence[float]], pipe: Callable[..., DrillStrin
     return len(known) == len(found) and 1.96 * float(np.std(known)) <= MOST_IMPEDANCE_SPREAD * float(np.mean(known))
 
 
+def _in_drive(law: SpeedController, factor: float) -> SpeedController:
+    """Return a controller in the drive's own N·m. ``factor``: true torque over the drive's (`calibration_factor`)."""
+    return replace(law, gain_nm_s_rad=law.gain_nm_s_rad / factor, integral_nm_rad=law.integral_nm_rad / factor,
+                   compensated_kg_m2=law.compensated_kg_m2 / factor)
+
+
 def _present(measured: Mapping[str, Any], square: float) -> tuple[SpeedController, tuple[Ends, ...]]:
     """Return the present controller of the drive, and both ends of each gain."""
     from tdhil.soft_torque import Moved, SpeedController
@@ -563,13 +573,17 @@ def _tuned_for(
     from tdhil.soft_torque import drive_settings
 
     settings: dict[str, tuple[DriveSetting, ...]] = {}
-    warnings = inertia_warnings(result)
+    warnings, factor = inertia_warnings(result), calibration_factor(result)
+    if factor != 1.0:
+        warnings.append(f"The result has a torque calibration (factor {factor:.4g}), which the drive does not know. P "
+                        "and I in the table are in true N·m. The values of the drive's parameters are divided by this "
+                        "factor: type in these.")
     ratio = float(result["gear_ratio"])
     if profile is not None and namespace.loop == "drive":
         parameters = speed_controller_of(profile, result)
         for one in tuning.tuned:
             if one.controller is not None and parameters is not None:
-                at_motor = one.controller.at_shaft(ratio)
+                at_motor = _in_drive(one.controller.at_shaft(ratio), factor)
                 settings[one.kind] = drive_settings(parameters, at_motor, namespace.rated_torque, namespace.rated_speed)
         if parameters is not None and parameters.note:
             warnings.append(f"{profile.name}: {parameters.note}")

@@ -15,10 +15,12 @@ from tdhil.cli.report_file import ReportFile, add_head_options, add_report_optio
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
     bounded_estimate,
+    calibration_factor,
     check_inner_lags,
     check_limits,
     check_present,
     ends_of,
+    in_drive_torque,
     inertia_to_tune_for,
     inertia_warnings,
     is_number,
@@ -104,7 +106,7 @@ def run(namespace: argparse.Namespace) -> int:
         require_extra("--plot")
         require_target("--plot", namespace.plot, [namespace.result], "the result")
     with working("reading the result …"):        # a log is identified again, which takes seconds
-        result = read_result(namespace.result)
+        result = in_drive_torque(read_result(namespace.result))
         measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
     lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)
     plant = plant_of(result, lags, dead_time, namespace.result)
@@ -249,6 +251,9 @@ def _tuned_for(
 
     settings = {}
     warnings = inertia_warnings(result)
+    if (factor := calibration_factor(result)) != 1.0:
+        warnings.append(f"The result has a torque calibration (factor {factor:.4g}), which the drive does not know. J, "
+                        "friction, P and I are therefore in the drive's own N·m: true values divided by this factor.")
     parameters = speed_controller_of(profile, result)
     if profile is not None and parameters is not None:
         for row in design.rows:

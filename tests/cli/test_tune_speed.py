@@ -279,3 +279,19 @@ def test_picture_and_page_are_written_and_nothing_is_overwritten(tuned, tmp_path
     assert text.count("<svg") == 2 and "SIMULATED" in text and "TDH-056" in text
     assert tuned("--plot", picture)[0] == ExitCode.USAGE
     assert tuned("--report", page)[0] == ExitCode.USAGE
+
+
+def test_the_gains_of_a_calibrated_result_are_in_the_drive_s_own_torque(tuned):
+    """The drive knows no calibration: with T = κ T_drive, (J/κ) ω' = T_drive is the shaft that its controller sees."""
+    _, plain, _ = tuned()
+    factor = 1.1
+    scaled = {name: {key: factor * value if isinstance(value, float) and key != "confidence" else value
+                     for key, value in result()[name].items()}
+              for name in ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm")}
+    code, found, _ = tuned(**scaled, torque_calibration={"factor": factor, "rel_sd": 0.005})
+    assert code == 0
+    ours, theirs = (document["controllers"][-1] for document in (found, plain))
+    for name in ("gain_nm_s_rad", "integral_nm_rad"):
+        assert ours[name] == pytest.approx(theirs[name], rel=1e-6)
+    assert any("torque calibration (factor 1.1)" in warning for warning in found["warnings"])
+    assert not any("torque calibration" in warning for warning in plain["warnings"])
