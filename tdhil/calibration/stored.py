@@ -120,6 +120,7 @@ class StoredCalibration:
             torque_offset_nm=factor * recording.torque_offset_nm,
             torque_resolution_nm=factor * recording.torque_resolution_nm,
             torque_scale_rel_sd=self.rel_sd,
+            torque_agreement_rel_sd=recording.torque_scale_rel_sd,
             impedance=None if asked is None else replace(
                 asked, torque_ratio=factor * asked.torque_ratio, torque_ratio_rel_sd=ratio_sd),
         )

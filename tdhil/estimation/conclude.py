@@ -37,6 +37,7 @@ def conclude(case: Case, finding: Finding) -> Identification:
         "verdict": verdict, "reason": reason, "advice": advice, "entry": entry, "inertia": inertia,
         "calibration_advised": calibrate,
         "warnings": warnings, "paper": case.paper, "torque_ratios": case.torque_ratios,
+        "torque_scale_rel_sd": case.recording.torque_scale_rel_sd,
         "periods_used": case.periods_used,
         "samples_used": case.samples_used if finding.samples_used is None else finding.samples_used,
     })

@@ -548,5 +548,6 @@ class Identification(ModelResult):
     samples_used: int = 0
     impedance: DriveImpedance | None = None             # of a run that measured the drive's impedance
     torque_ratios: tuple[TorqueRatio, ...] = ()         # of each torque signal; empty without a known setpoint
+    torque_scale_rel_sd: float | None = None            # in the total intervals; None: that of the recording
     frequency_response: FrequencyResponse | None = None     # of a periodic excitation with two or more periods
     entry: MessageCode = MessageCode.NOT_IDENTIFIABLE   # entry of verdict, reason and advice in the table of messages

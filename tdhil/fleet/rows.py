@@ -207,6 +207,8 @@ def row_of(
     calibration = document.get("torque_calibration")
     if isinstance(calibration, Mapping):
         facts |= {"torque_calibration": calibration.get("date"), "torque_scale_rel_sd": calibration.get("rel_sd")}
+    if isinstance(used := document.get("torque_scale_rel_sd"), float):      # wider if the torque signals differ
+        facts |= {"torque_scale_rel_sd": used}
     was = _stored(stored)
     verdict, value = document["verdict"], found["inertia_kg_m2"]
     changed = None

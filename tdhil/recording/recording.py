@@ -194,6 +194,7 @@ class Recording:
     torque_limit_nm: float | None = None
     torque_offset_nm: float = 0.0          # reported at standstill, de-energised; subtracted by identification
     torque_scale_rel_sd: float = 0.0       # 1 sd of the drive's torque scale, as a share of the reading
+    torque_agreement_rel_sd: float | None = None        # the same of reported over commanded torque; None: equal
     gear_ratio: float = 1.0                # i = ω_motor / ω_main
     timing_half_width_s: float = 0.0       # usual half-width of a transaction, within which a sample was taken
     stepped_setpoint: SteppedSetpoint | None = None     # of speed mode

@@ -197,6 +197,7 @@ def result_document(
         },
         "speed_loop_present": speed_loop_present_of(run),
         "torque_ratios": [asdict(ratio) for ratio in found.torque_ratios],
+        "torque_scale_rel_sd": found.torque_scale_rel_sd,
         "lines": [asdict(line) for line in found.lines],
         "frequency_response": _response(found.frequency_response),
         "periods_used": found.periods_used,
@@ -344,7 +345,8 @@ def _scaled(estimate: Estimate | None, found: Identification, recording: Recordi
     if estimate is None:
         return None
     confidence = Options().confidence if found.inertia is None else found.inertia.confidence
-    total = with_total(estimate, recording.torque_scale_rel_sd, confidence, ())
+    scale = recording.torque_scale_rel_sd if found.torque_scale_rel_sd is None else found.torque_scale_rel_sd
+    total = with_total(estimate, scale, confidence, ())
     low = total.low_total if estimate.low < 0.0 else max(total.low_total, 0.0)
     return asdict(estimate) | {"low_total": low, "high_total": total.high_total}
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from tdhil.calibration import StoredCalibration
 from tdhil.estimation import Options, Verdict, identify, torque_contradiction, torque_ratios
 from tdhil.recording.recording import Recording, Stage
+from tdhil.report import result_document
 from tests.estimation.shaft_bench import DT
 from tests.estimation.stages_bench import Stages, run_stages, turn
 
@@ -154,6 +156,33 @@ def test_a_difference_that_the_scale_allows_widens_it_until_both_torques_fit(run
     assert found.verdict is Verdict.VALID
     assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
     assert any("torque scale was widened from 2.00 %" in warning for warning in found.warnings)
+
+
+@pytest.mark.heavy(but_first=1)
+@pytest.mark.parametrize("scale", [0.975, 1.02])
+def test_a_torque_calibration_does_not_make_two_torques_contradict_each_other(runs, scale):
+    """It fixes the scale of the reported torque; the ratio to the commanded torque is as sure as before."""
+    calibrated = StoredCalibration(1.0 / scale, 0.992 / scale, 1.008 / scale, 0.95, "2026-01-01", {}, {}, True)
+    found = identify(calibrated.applied(replace(runs[0], torque_nm=scale * runs[0].torque_nm)), Options(tolerance=0.2))
+    assert found.verdict is Verdict.VALID and found.torque_scale_rel_sd == calibrated.rel_sd
+    assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
+    assert not any("was widened" in warning for warning in found.warnings)
+    assert any("the torque calibration is that of the reported torque" in warning for warning in found.warnings)
+
+
+@pytest.mark.heavy
+def test_friction_has_the_torque_scale_of_j(runs):
+    """In one document the scale that was widened is in the total interval of each quantity that contains torque."""
+    found = identify(one := replace(runs[0], torque_nm=0.965 * runs[0].torque_nm), Options(tolerance=0.2))
+    document = result_document(found, one, {}, "")
+    assert document["torque_scale_rel_sd"] > 0.025
+
+    def scale(part):
+        total, own = (0.5 * (part[high] - part[low]) / part["value"]
+                      for low, high in (("low_total", "high_total"), ("low", "high")))
+        return np.sqrt(total**2 - own**2)
+
+    assert scale(document["coulomb_nm"]) == pytest.approx(scale(document["inertia_kg_m2"]), rel=1e-2)      # without it: 0.73 of that
 
 
 @pytest.mark.heavy

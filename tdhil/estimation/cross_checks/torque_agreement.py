@@ -263,15 +263,22 @@ def torques_compared(case: Case) -> Case:
 def torques_judged(case: Case) -> Case:
     """Return the case, with a wider torque scale if a ratio differs from 1 by less than that scale allows.
 
-    Raises Refused if a ratio differs by more: J would be wrong by that factor, and the true torque is unknown.
+    Raises Refused if a ratio differs by more: J would be wrong by that factor, and the true torque is unknown. A torque
+    calibration fixes the scale of the reported torque. The ratio to the commanded torque is no surer by it: the scale
+    of before is allowed, and the calibrated scale stays.
     """
-    scale = case.recording.torque_scale_rel_sd
+    before = case.recording.torque_agreement_rel_sd
+    scale = case.recording.torque_scale_rel_sd if before is None else before
     refusal = torque_contradiction(case.torque_ratios, scale)
     if refusal is not None:
         raise Refused(refusal.reason, refusal.advice, refusal.entry)
     worst = _worst(case.torque_ratios)
     if worst is None:
         return case
+    if before is not None:
+        warning = CodedText(f"{_sentence(worst)}; the torque calibration is that of the reported torque, and stays",
+                            MessageCode.TORQUE_SIGNALS_DIFFER)
+        return replace(case, warnings=(*case.warnings, warning))
     widened = replace(
         case.recording, torque_scale_rel_sd=math.hypot(scale, abs(worst.ratio.value - 1.0) / normal_quantile(0.95)))
     warning = (
