@@ -19,6 +19,7 @@ is the covariance of one period (complex: E|·|² per period), the speed-torque 
 in torque mode, a disturbance is in both signals; the variance of T − G W is correct only with the cross term.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -334,18 +335,24 @@ def pooled_lines(
     frequencies = sorted({round(hertz, 9) for fit in fits for hertz in fit.lines_hz})
     pooled = []
     for hertz in frequencies:
-        speeds, torques, rounding = [], [], []
+        speeds, torques, having = [], [], []
         for fit, rate in zip(fits, rates, strict=True):
             torque = torque_lines(fit, viscous, rate)
             for column, own in enumerate(fit.lines_hz):
                 if round(own, 9) == hertz and len(fit.speed) > 0:
                     speeds.append(fit.speed[:, column])
                     torques.append(torque[:, column])
-                    rounding.append(len(fit.speed) * np.asarray(fit.rounding))
-        line = _pool(hertz, speeds, torques, rounding)
+                    having.append(fit)
+        line = _pool(hertz, speeds, torques, having)
         if line is not None:
             pooled.append(line)
     return tuple(pooled)
+
+
+def mean_rounding(fits: Sequence[PeriodLines]) -> FloatArray:
+    """Return E|·|² of the rounding of speed and torque, (2,), as for new in each period, mean of the segments."""
+    found: FloatArray = np.mean([len(fit.speed) * np.asarray(fit.rounding) for fit in fits], axis=0)
+    return found
 
 
 def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> ComplexArray:
@@ -355,11 +362,9 @@ def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> Compl
 
 
 def _pool(
-    hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray], rounding: list[FloatArray]
+    hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray], having: list[PeriodLines]
 ) -> SpectralLine | None:
-    """Return the pooled line; None without a known scatter. ``rounding``: rounding error of each segment, as for new
-    in each period.
-    """
+    """Return the pooled line; None without a known scatter. ``having``: the segments with this line."""
     nu = float(sum(len(speed) - 1 for speed in speeds))
     if nu < 1.0:
         return None
@@ -370,7 +375,7 @@ def _pool(
         s_ww += float(np.sum(np.abs(dw) ** 2)) / nu
         s_tt += float(np.sum(np.abs(dt) ** 2)) / nu
         s_tw += complex(np.sum(dt * dw.conj())) / nu
-    by_rounding = np.mean(rounding, axis=0)
+    by_rounding = mean_rounding(having)
     s_ww += float(by_rounding[0])
     s_tt += float(by_rounding[1])
     mean_speed = np.array([speed.mean() for speed in speeds])

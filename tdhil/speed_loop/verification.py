@@ -45,18 +45,18 @@ moves it by two standard deviations (a third of the half-width each). The second
 longer record must be longer."""
 LEAST_PAIRS = 8
 """Smallest number of pairs of steps. With fewer, their scatter is too uncertain."""
+_QUANTITIES = ("overshoot_share", "rise_s", "settling_s", "gain_nm_s_rad", "integral_nm_rad")
+_TAIL = 0.5 * (1.0 - CONFIDENCE) / len(_QUANTITIES)    # probability beyond one end of an interval
+_REACH = 2.85              # sd of a normal distribution that the ends of `_DRAWS` draws reach on average, at `_TAIL`
 _DRAWS, _LEAST_KEPT = 400, 40
 """Number of random draws of the fitted loop, for the intervals of its figures, and the likeliest that always count."""
 _EXCLUDED = 31.3
 """Rise of the fit's cost from which the response excludes a draw: 99.9 % quantile of χ² with 11 degrees of freedom."""
-_SHUFFLES = 300
-"""Number of random sign changes of the pairs, for the probability of the misfit."""
+_SHUFFLES = 300            # random sign changes of the pairs, for the probability of the misfit
 _LEAST_SD, _WHITE_SHARE = 1e-9, 1e-3
 """Least noise of the mean response, as a share of the step, and least white part of its power."""
-_MOST_SAMPLES = 1500
-"""Largest number of samples whose correlation is computed; its time grows with the third power."""
-_ROUNDS = 12
-"""Number of iterations of the fit."""
+_MOST_SAMPLES = 1500       # whose correlation is computed; its time grows with the third power
+_ROUNDS = 12               # iterations of the fit
 _LARGEST_MOVE = 0.4
 """Largest change of ln P and ln I in one iteration."""
 _SPAN = 30.0
@@ -197,7 +197,11 @@ def verify_steps(
     birge = max(1.0, squares / max(float(np.mean(left)), 1e-18))
     moves = scatter @ slopes @ inverse
     covariance = birge * moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
-    rows = _rows(model, _possible(theta, covariance, cost, birge), covariance, number)
+    from scipy.special import stdtrit
+
+    factor = float(stdtrit(number - 1, 1.0 - _TAIL))
+    wider = (factor / _REACH) ** 2
+    rows = _rows(model, _possible(theta, wider * covariance, cost, wider * birge), covariance, factor)
     amplitude = abs(model.rounding_amplitude(theta)) if model.counts < FEW_COUNTS else 0.0
     alike = amplitude > (ROUNDED_AMPLITUDE if chance < UNLIKE_P else QUIET_AMPLITUDE)
     explained = rms <= UNLIKE_RMS or chance >= UNLIKE_P
@@ -294,25 +298,20 @@ def _slopes(model: StepModel, theta: Reals, now: Reals) -> Reals:
     return np.array(columns).T
 
 
-def _rows(model: StepModel, draws: Sequence[Reals], covariance: Reals, number: int) -> tuple[StepRow, ...]:
-    """Return the compared quantities. ``draws``: parameters that the response permits, the fitted ones first."""
-    from scipy.special import stdtrit
-
+def _rows(model: StepModel, draws: Sequence[Reals], covariance: Reals, factor: float) -> tuple[StepRow, ...]:
+    """Return the compared quantities. ``draws``: possible parameters, fitted ones first; ``factor``: Student's."""
     case, theta = model.case, draws[0]
-    names = ("overshoot_share", "rise_s", "settling_s", "gain_nm_s_rad", "integral_nm_rad")
-    factor = float(stdtrit(number - 1, 0.5 + 0.5 * (1.0 - (1.0 - CONFIDENCE) / len(names))))
     typed = (case.gains.gain_nm_s_rad, case.gains.integral_nm_rad)
     gains, fitted = [], model.loop(theta)[1]
     for k, (value, found) in enumerate(zip(typed, (fitted.gain_nm_s_rad, fitted.integral_nm_rad), strict=True)):
-        half = factor * sqrt(float(covariance[k, k]))
-        gains.append(StepRow(names[3 + k], Range(found, found * exp(-min(half, 50.0)), found * exp(min(half, 50.0))),
-                             Range(value, value, value)))
+        by = exp(min(factor * sqrt(float(covariance[k, k])), 50.0))
+        gains.append(StepRow(_QUANTITIES[3 + k], Range(found, found / by, found * by), Range(value, value, value)))
     figures = _figures(model, draws)
     rows = []
-    for k, name in enumerate(names[:3]):
-        values, share = figures[:, k], 0.5 * (1.0 - CONFIDENCE) / len(names)
+    for k, name in enumerate(_QUANTITIES[:3]):
+        values = figures[:, k]
         finite = bool(np.all(np.isfinite(values)))
-        low, high = np.quantile(values, (share, 1.0 - share)) if finite else (np.min(values), inf)
+        low, high = np.quantile(values, (_TAIL, 1.0 - _TAIL)) if finite else (np.min(values), inf)
         value = float(values[0])
         rows.append(StepRow(name, Range(value, min(float(low), value), max(float(high), value)), getattr(case, name)))
     return (*rows, *gains)

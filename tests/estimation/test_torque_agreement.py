@@ -182,7 +182,7 @@ def test_friction_has_the_torque_scale_of_j(runs):
                       for low, high in (("low_total", "high_total"), ("low", "high")))
         return np.sqrt(total**2 - own**2)
 
-    assert scale(document["coulomb_nm"]) == pytest.approx(scale(document["inertia_kg_m2"]), rel=1e-2)      # without it: 0.73 of that
+    assert scale(document["coulomb_nm"]) == pytest.approx(scale(document["inertia_kg_m2"]), rel=1e-2)
 
 
 @pytest.mark.heavy

@@ -1,5 +1,7 @@
 """What dies away in the modes of a shaft that swings: taken off its lines, and left alone where nothing does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -109,3 +111,14 @@ def test_a_few_periods_are_left_alone():
 
 def _alike(one, other):
     return all(np.array_equal(a, b) for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
+
+
+def test_lines_without_what_dies_away_keep_the_allowance_for_repeating_rounding():
+    """Rounding that repeats in each period is in the mean of a line, and no scatter shows it."""
+    fits, cut = fits_of(1)
+    coarse = tuple(replace(fit, rounding=(1e-6, 0.04)) for fit in fits)
+    fine, rounded = settled_lines(fits, cut, 0.0), settled_lines(coarse, cut, 0.0)
+    for one, other in zip(fine, rounded, strict=True):
+        assert other.s_ww - one.s_ww == pytest.approx(1e-6 * PERIODS, rel=1e-6)
+        assert other.s_tt - one.s_tt == pytest.approx(0.04 * PERIODS, rel=1e-6)
+        assert np.array_equal(one.speed, other.speed)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 from tdhil.speed_loop import (
     LoopPlant,
@@ -248,3 +249,15 @@ def test_where_the_response_excludes_all_draws_the_likeliest_ones_count():
     assert len(kept) == 1 + verification._LEAST_KEPT
     assert away[0] == 0.0 and np.all(np.diff(away) >= 0.0)
     assert away[-1] < 1.0      # four of ten of a normal distribution of two parameters
+
+
+def test_the_figures_reach_as_far_as_p_and_i_with_few_pairs_and_with_many():
+    """Rise time and overshoot of random draws have Student's interval, as P and I: a joint coverage is of all rows."""
+    widths = []
+    for number in (8, 60):
+        factor = float(stdtrit(number - 1, 1.0 - verification._TAIL))
+        wider = (factor / verification._REACH) ** 2
+        draws = verification._possible(np.zeros(2), wider * np.eye(2), lambda one: 0.0, 1.0)
+        low, high = np.quantile([one[0] for one in draws], (verification._TAIL, 1.0 - verification._TAIL))
+        widths.append(0.5 * (high - low) / factor)
+    assert widths == [pytest.approx(widths[0])] * 2 and 0.85 < widths[0] < 1.15

@@ -25,7 +25,15 @@ from functools import cached_property
 import numpy as np
 
 from tdhil.estimation.samples import Stretch
-from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, pooled_lines, torque_lines
+from tdhil.estimation.spectrum import (
+    FLOOR,
+    ComplexArray,
+    PeriodLines,
+    SpectralLine,
+    mean_rounding,
+    pooled_lines,
+    torque_lines,
+)
 from tdhil.recording import FloatArray
 
 MOST_MODES = 3            # decaying modes, at most
@@ -144,7 +152,9 @@ def settled_lines(
     if not modes:
         return plain
     swings = [segment.swing(modes) for segment in segments]
-    return tuple(_line(hertz, column, segments, swings, len(modes)) for column, hertz in enumerate(fits[0].lines_hz))
+    rounding = mean_rounding(fits)       # it repeats in each period, so that the scatter does not show it
+    return tuple(
+        _line(hertz, column, segments, swings, len(modes), rounding) for column, hertz in enumerate(fits[0].lines_hz))
 
 
 def _segment(fit: PeriodLines, torque: ComplexArray, stretch: Stretch, viscous: float) -> _ScaledSegment:
@@ -218,7 +228,8 @@ def _refined(segments: Sequence[_ScaledSegment], modes: tuple[complex, ...]) -> 
 
 
 def _line(
-    hertz: float, column: int, segments: Sequence[_ScaledSegment], swings: Sequence[_ModeShare], modes: int
+    hertz: float, column: int, segments: Sequence[_ScaledSegment], swings: Sequence[_ModeShare], modes: int,
+    rounding: FloatArray,
 ) -> SpectralLine:
     nu, means, counts = 0.0, [], []
     scatter = np.zeros((2, 2), dtype=np.complex128)
@@ -233,7 +244,6 @@ def _line(
     nu = max(1.0, nu - modes / (2.0 * len(segments[0].omega)))
     speed, torque = np.array(means).T
     covariance = scatter / nu
-    return SpectralLine(
-        hertz, speed, torque, np.array(counts), float(covariance[0, 0].real), float(covariance[1, 1].real),
-        complex(covariance[1, 0]), nu,
-    )
+    s_ww, s_tt = (float(covariance[k, k].real) + float(rounding[k]) + FLOOR * float(np.max(np.abs(means) ** 2))
+                  for k, means in enumerate((speed, torque)))
+    return SpectralLine(hertz, speed, torque, np.array(counts), s_ww, s_tt, complex(covariance[1, 0]), nu)
