@@ -52,7 +52,8 @@ class CalibrationCase:
 
     ``covariance_known`` (n, n): for known filters of the reports. ``sharing``: test whether the runs share the filters;
     None: not tested. ``scale_rel_sd``: stated standard uncertainty of the torque scale before this calibration.
-    ``gear_ratio`` i = ω_motor/ω_main.
+    ``gear_ratio`` i = ω_motor/ω_main. ``reading_rel_sd``: relative standard uncertainty that all J share, because the
+    torque is read in step with a speed setpoint; it cancels in J without the body, and κ has all of it.
     """
 
     runs: tuple[BodyRun, ...]
@@ -65,6 +66,7 @@ class CalibrationCase:
     scale_rel_sd: float = 0.02
     gear_ratio: float = 1.0
     confidence: float = 0.95
+    reading_rel_sd: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -285,9 +287,13 @@ def _propagated(
             names = ", ".join(run.name for run, one in zip(case.runs, has, strict=True) if one)
             shares = (abs(float(np.sum(one[has]))) * slope * sd for one in both)
             lines.append(CalibrationLine(f"body of {names}", sd, "normal", CERTAIN, *shares))
+    reading = case.reading_rel_sd
+    if reading > 0.0:
+        lines.append(CalibrationLine(
+            "moment of reading", reading * float(intercept), "rectangular", CERTAIN, reading, 0.0))
     found, of_bodies = [], slope**2 * _of_bodies(case)
-    for value, row in ((factor, both[0]), (inertia, both[1])):
-        runs, bodies = float(row @ case.covariance @ row), float(row @ of_bodies @ row)
+    for value, row, shared_sd in ((factor, both[0], reading), (inertia, both[1], 0.0)):
+        runs, bodies = float(row @ case.covariance @ row), float(row @ of_bodies @ row) + shared_sd**2
         variance = runs + bodies
         dof = effective_degrees_of_freedom(((math.sqrt(runs), case.degrees_of_freedom), (math.sqrt(bodies), CERTAIN)))
         found.append(measured_value(float(value), math.sqrt(variance) * abs(float(value)), dof, case.confidence))

@@ -35,6 +35,7 @@ from tdhil.estimation.samples import (
     usable_samples as usable_samples,
 )
 from tdhil.estimation.shared_filters import FittedTogether as FittedTogether, identify_together as identify_together
+from tdhil.estimation.setpoint_sampling import worst_share as worst_share
 from tdhil.estimation.spectrum import (
     SpectralLine as SpectralLine, period_lines as period_lines, pooled_lines as pooled_lines,
 )

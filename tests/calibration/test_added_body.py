@@ -3,14 +3,15 @@
 import re
 from dataclasses import replace
 from math import hypot, sqrt
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tdhil.calibration import BodyRun, CalibrationCase, calibrate_torque, plan_bodies
 from tdhil.errors import UsageError
-from tdhil.estimation import Verdict
-from tdhil.recording import Stage
+from tdhil.estimation import Verdict, worst_share
+from tdhil.recording import Stage, SteppedSetpoint
 from tdhil.session import find_calibration, find_plan
 from tests.calibration.bodies import IDENTITY, INERTIA, SCALE, recording, run, two
 
@@ -202,3 +203,39 @@ def test_a_body_is_not_better_known_if_it_is_mounted_more_often(runs):
     assert len(of_body) == 1 and of_body[0].of_factor == pytest.approx(0.01, rel=1e-3)
     squares = sqrt(sum(line.of_factor**2 for line in found.budget))
     assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
+
+
+def test_what_all_runs_read_alike_is_in_the_factor_and_cancels_in_j():
+    """Torque that is read in step with a speed setpoint: J of each run has the same relative error."""
+    plain = calibrate_torque(case([104.0, 159.0], [0.0, 55.0]))
+    found = calibrate_torque(case([104.0, 159.0], [0.0, 55.0], reading_rel_sd=0.02))
+    assert found.inertia_kg_m2 == plain.inertia_kg_m2
+    assert found.factor.standard_uncertainty == pytest.approx(
+        sqrt(plain.factor.standard_uncertainty**2 + (0.02 * found.factor.value) ** 2), rel=1e-9)
+    squares = sqrt(sum(line.of_factor**2 for line in found.budget))
+    assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
+
+
+@pytest.mark.heavy
+def test_runs_in_step_with_a_setpoint_have_its_reading_in_the_factor(tmp_path):
+    stepped = SteppedSetpoint(1.0 / 15.0, 0.9, 1.0, 0.35)
+    runs = [replace(one, record=replace(one.record, recording=replace(one.record.recording, stepped_setpoint=stepped)))
+            for one in two(tmp_path)]
+    found = find_calibration(runs, "motor")
+    (line,) = (line for line in found.calibration.budget if line.source == "moment of reading")
+    worst = max(worst_share(stepped, one.torque_lag_s.low) for one in found.identified)
+    assert line.of_factor == pytest.approx(worst / sqrt(3.0)) and line.of_factor > 0.001 and line.of_inertia == 0.0
+
+
+@pytest.mark.parametrize("other", [
+    {"model": "rigid+lags, bent friction"}, {"harmonics": ("one",)}, {"backlash": ("one",)},
+])
+def test_runs_with_more_than_a_rigid_shaft_and_straight_friction_are_not_fitted_together(other, monkeypatch):
+    from tdhil.session import torque_calibration
+
+    plain = SimpleNamespace(model="rigid+lags", harmonics=(), backlash=(),
+                            inertia=SimpleNamespace(value=104.0, low=103.0, high=105.0, confidence=0.95))
+    fitted = SimpleNamespace(inertia_kg_m2=1, covariance=1, covariance_known_filters=1, degrees_of_freedom=1, sharing=1)
+    monkeypatch.setattr("tdhil.estimation.identify_together", lambda recordings: fitted)
+    assert torque_calibration._joint((None, None), (plain, plain))[-1] is True
+    assert torque_calibration._joint((None, None), (plain, SimpleNamespace(**{**vars(plain), **other})))[-1] is False
