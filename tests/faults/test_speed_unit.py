@@ -302,7 +302,7 @@ def test_a_name_takes_counts_that_are_wrong_where_no_harm_follows(made, bus):
     cause = rig.run(simulated=False).cause
     assert exit_code(cause) == 4
     assert "too large by a factor of 2" in cause.what
-    assert "position: null" in cause.next_step
+    assert "counts per turn" in cause.next_step
     again = made(bus, 1.0, (old, new))
     assert isinstance(again.run(simulated=False, limits=replace(LIMITS, accept_speed_unit=True)).cause, Enough)
 
