@@ -46,7 +46,7 @@ OF_THE_TERMINAL = {
     "tdhil/service/supervisor.py": "arguments of a process",
     "tdhil/service/worker.py": "arguments of a process",
     "tdhil/session/evaluation.py": "tdhil evaluate",
-    "tdhil/session/reference_calibration.py": "tdhil calibrate torque with a reference sensor",
+    "tdhil/calibration/reference.py": "tdhil calibrate torque with a reference sensor",
     "tdhil/session/speed_calibration.py": "tdhil calibrate speed",
     "tdhil/session/stored_calibration.py": "the file of a calibration",
 }
