@@ -72,6 +72,7 @@ class PairsFit:
     refusal: str = ""
     budget: tuple[FactorLine, ...] = ()
     too_wide: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 def line_with_errors_in_both(

@@ -5,6 +5,7 @@ pipe.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -92,7 +93,7 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     rel_sd, warnings = _reference_sd(namespace)
     scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:
-        found = calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale)
+        found = replace(calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale), warnings=warnings)
     except ValueError as error:
         raise UsageError(str(error), where=str(namespace.pairs)) from None
     drive = {} if record is None else drive_identity(record.configuration)
@@ -101,7 +102,7 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
         found, pairs, str(namespace.pairs), drive, settings, confidence=confidence,
         date=datetime.now().astimezone().isoformat(timespec="seconds"),
         simulated=record is not None and record.recording.simulated,
-        runs=() if record is None else (log_of_calibration(record),), warnings=warnings)
+        runs=() if record is None else (log_of_calibration(record),))
     return document, record
 
 

@@ -45,7 +45,7 @@ PAIRS, REFERENCE, KNOWN_PIPE = "pairs", "reference", "known_pipe"
 
 def pairs_document(
     found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
-    simulated: bool, runs: Sequence[Part] = (), warnings: Sequence[str] = (),
+    simulated: bool, runs: Sequence[Part] = (),
 ) -> dict[str, Any]:
     """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log."""
     return {
@@ -67,7 +67,7 @@ def pairs_document(
         ],
         "line": {"slope": found.factor.value, "intercept_nm": found.offset_nm.value,
                  "covariance": found.covariance.tolist()},
-        **_ended(source, runs, drive, settings, date, simulated, warnings),
+        **_ended(source, runs, drive, settings, date, simulated, found.warnings),
     }
 
 
