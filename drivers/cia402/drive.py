@@ -432,7 +432,7 @@ class Cia402Drive:
         mode.cycles += 1
         again = code != reported.shown_code and mode.cycles >= REPEAT_MODE_CYCLES
         changes = code != mode.code or again or mode.overwritten
-        word = DISABLE_VOLTAGE if power.removes_torque else controlword_towards(reported.state, power.wish)
+        word = controlword_towards(reported.state, power.wish, removes_torque=power.removes_torque)
         if content.vl and word == ENABLE_OPERATION:    # in vl mode the setpoint acts only with bits 4 to 6 set
             word |= VL_RELEASED
         # Recorded before they are sent: an answer in this cycle may show them.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from drivers.cia402.objects import Objects, name
 from drivers.cia402.process_data import VELOCITY_ACTUAL, VL_ACTUAL, decode_value
-from drivers.cia402.state_machine import DISABLE_VOLTAGE, State, controlword_towards
+from drivers.cia402.state_machine import State, controlword_towards
 from drivers.drive import PowerRequest
 from drivers.errors import CommunicationLost, ObjectRefused
 from profiles.cia402 import Cia402Profile, ObjectType
@@ -78,5 +78,5 @@ def push(
             with suppress(CommunicationLost, ObjectRefused):
                 objects.write(offset[0], offset[1], 0, offset[2])
         with suppress(CommunicationLost, ObjectRefused):       # the next poll shows the result
-            objects.write(0x6040, 0, DISABLE_VOLTAGE if removes_torque else controlword_towards(state, wish), 16)
+            objects.write(0x6040, 0, controlword_towards(state, wish, removes_torque=removes_torque), 16)
     return True

@@ -17,7 +17,6 @@ from drivers.cia402.position import find_angle
 from drivers.cia402.preflight import read_identity, speed_unit
 from drivers.cia402.process_data import TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL
 from drivers.cia402.state_machine import (
-    DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     QUICK_STOP,
     TARGET_REACHED,
@@ -107,7 +106,7 @@ class Standing:
             index, sub, _ = self.offset or (0x6071, 0, 16)
             self._put(index, sub, bytes(2))
         else:
-            word = DISABLE_VOLTAGE if removes_torque else controlword_towards(state, wish)
+            word = controlword_towards(state, wish, removes_torque=removes_torque)
             self._put(0x6040, 0, word.to_bytes(2, "little"))
 
 

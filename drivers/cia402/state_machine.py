@@ -107,16 +107,18 @@ _TOWARDS_OFF = {
 }
 
 
-def controlword_towards(state: State, wish: PowerRequest) -> int:
+def controlword_towards(state: State, wish: PowerRequest, *, removes_torque: bool = False) -> int:
     """Return the controlword that brings the drive one transition nearer to ``wish``.
 
     It never resets a fault and never ends a quick stop by enabling. Both need a request of their own; until then the
-    word is harmless.
+    word is harmless. ``removes_torque``: the power stage is switched off at once, in any state and for any ``wish``.
 
     Quick stop is the same word in every state. A drive that is not in operation switches off or does nothing
     (transitions 7 and 10). If the shown state is old or another node's and the drive is in operation, the shaft stops.
     So it is also the word for a drive that shows no valid state, for any ``wish``: disabling could let a shaft coast.
     """
+    if removes_torque:
+        return DISABLE_VOLTAGE
     if state is State.UNKNOWN:
         return QUICK_STOP
     if wish is PowerRequest.ENABLED:

@@ -392,15 +392,12 @@ class ModbusDrive:
 
     def _word(self, mode: Mode) -> int:
         """Return the control word towards the present request."""
-        control = self._profile.control
-        if self._removes_torque and control.coast is not None:
-            return control.coast | (control.torque_bits if mode is Mode.TORQUE else control.speed_bits)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
         # A drive that was enabled and shows no valid state is not disabled: it is braked at any reported speed.
         unknown = self._ever_enabled and power_state(self._state) is PowerState.UNKNOWN
         return controlword_towards(
-            control, self._state, self._wish, mode, reverse=self._reverse,
-            turning=(turning or unknown) and not self._removes_torque,
+            self._profile.control, self._state, self._wish, mode, reverse=self._reverse, turning=turning or unknown,
+            removes_torque=self._removes_torque,
         )
 
     def _insist(self, got: Round, setpoints: Setpoints, mode: Mode, begun_s: float) -> Round:

@@ -102,14 +102,18 @@ def power_state(state: StatusState | None) -> PowerState:
 
 def controlword_towards(
     control: Control, state: StatusState | None, wish: PowerRequest, mode: Mode, *, reverse: bool = False,
-    turning: bool = False
+    turning: bool = False, removes_torque: bool = False
 ) -> int:
     """Return the control word that brings the drive one step nearer to ``wish``.
 
     It never resets a fault, never ends a quick stop by enabling, and never disables a shaft that turns under power;
     such a shaft is braked. The same holds for a drive without a valid state: zeros from a gateway, or an unknown
-    pattern, do not prove that it is off.
+    pattern, do not prove that it is off. ``removes_torque``: the torque is removed at once, even
+    of such a shaft, with the word for a coast if the drive has one.
     """
+    mode_bits = control.torque_bits if mode is Mode.TORQUE else control.speed_bits
+    if removes_torque and control.coast is not None:
+        return control.coast | mode_bits
     power = power_state(state)
     under_power = power in _UNDER_POWER
     if wish is PowerRequest.ENABLED:
@@ -123,8 +127,8 @@ def controlword_towards(
         # Also while it is only ready: some drives show that while they still brake, and `off` would let them coast.
         word = control.quick_stop if under_power or power is PowerState.READY else control.off
     else:
-        word = control.quick_stop if under_power and turning else control.off
-    word |= control.torque_bits if mode is Mode.TORQUE else control.speed_bits
+        word = control.quick_stop if under_power and turning and not removes_torque else control.off
+    word |= mode_bits
     if reverse and control.reverse_bits is not None:
         word |= control.reverse_bits
     return word
