@@ -21,8 +21,8 @@ if TYPE_CHECKING:
         line_with_errors_in_both as line_with_errors_in_both,
     )
     from tdhil.calibration.reference import (
-        ASSUMED_REFERENCE as ASSUMED_REFERENCE, ASSUMED_REFERENCE_REL_SD as ASSUMED_REFERENCE_REL_SD,
         ReferenceFit as ReferenceFit, TorqueRecord as TorqueRecord, calibrate_reference as calibrate_reference,
+        scale_of_reference as scale_of_reference,
     )
     from tdhil.calibration.speed import (
         CountedTurns as CountedTurns, SpeedBudgetLine as SpeedBudgetLine, SpeedCalibration as SpeedCalibration,
@@ -37,7 +37,7 @@ else:
                       "calibrate_torque plan_bodies",
         "known_pipe": "KnownPipe KnownPipeFit PipeInput calibrate_known_pipe",
         "pairs": "PairsFit TorquePairs calibrate_pairs line_with_errors_in_both",
-        "reference": "ASSUMED_REFERENCE ASSUMED_REFERENCE_REL_SD ReferenceFit TorqueRecord calibrate_reference",
+        "reference": "ReferenceFit TorqueRecord calibrate_reference scale_of_reference",
         "speed": "CountedTurns SpeedBudgetLine SpeedCalibration calibrate_by_position calibrate_by_turns",
         "stored": "OWN_LOG CalibrationUnusable StoredCalibration",
     })

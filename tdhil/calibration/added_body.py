@@ -45,6 +45,11 @@ class BodyRun:
     noise_share: float = 0.0
     """Relative standard uncertainty of its J for known filters."""
 
+    @property
+    def body(self) -> tuple[float, float]:
+        """Return inertia and standard uncertainty. Runs with equal values have the same body."""
+        return self.added_kg_m2, self.added_sd_kg_m2
+
 
 @dataclass(frozen=True)
 class CalibrationCase:
@@ -233,10 +238,10 @@ _ROUNDS = 10
 def _of_bodies(case: CalibrationCase) -> FloatArray:
     """Return the covariance of the bodies' inertias, (n, n), (kg·m²)².
 
-    Runs with the same inertia and uncertainty have the same body: its error does not average out over them.
+    The error of a body does not average out over its runs.
     """
-    stated = [(run.added_kg_m2, run.added_sd_kg_m2) for run in case.runs]
-    return np.array([[one[1] * other[1] if one == other else 0.0 for other in stated] for one in stated])
+    bodies = [run.body for run in case.runs]
+    return np.array([[one[1] * other[1] if one == other else 0.0 for other in bodies] for one in bodies])
 
 
 def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
@@ -281,9 +286,9 @@ def _propagated(
     shared = [math.sqrt(max(float(one @ rest @ one), 0.0)) for one in both]
     scale = math.sqrt(max(float(np.trace(rest)) / len(case.runs), 0.0))
     lines.append(CalibrationLine("filters of the reports", scale, "Student", case.degrees_of_freedom, *shared))
-    for added, sd in dict.fromkeys((run.added_kg_m2, run.added_sd_kg_m2) for run in case.runs):
-        if sd > 0.0:
-            has = [(run.added_kg_m2, run.added_sd_kg_m2) == (added, sd) for run in case.runs]
+    for body in dict.fromkeys(run.body for run in case.runs):
+        if (sd := body[1]) > 0.0:
+            has = [run.body == body for run in case.runs]
             names = ", ".join(run.name for run, one in zip(case.runs, has, strict=True) if one)
             shares = (abs(float(np.sum(one[has]))) * slope * sd for one in both)
             lines.append(CalibrationLine(f"body of {names}", sd, "normal", CERTAIN, *shares))

@@ -47,9 +47,9 @@ LEAST_CORRELATION = 0.9
 LEAST_SWING_COUNTS = 20.0
 """Smallest swing of either torque, as a multiple of its own noise in the average or of its own count."""
 ASSUMED_REFERENCE_REL_SD = 0.003
-ASSUMED_REFERENCE = (f"the standard uncertainty of the sensor's scale was assumed to be "
-                     f"{100 * ASSUMED_REFERENCE_REL_SD:.1f} % (accuracy class 0.5); state it with --reference-sd")
 """Standard uncertainty of a sensor's scale if none is stated: accuracy class 0.5, rectangular (0.5 %/√3)."""
+_ASSUMED = (f"the standard uncertainty of the sensor's scale was assumed to be {100 * ASSUMED_REFERENCE_REL_SD:.1f} %"
+            " (accuracy class 0.5); state it with --reference-sd")
 LEAST_OWN_SHARE = 0.1
 """Least share of the torque's variance that its derivatives do not explain. A tone has none, steps have nearly all."""
 _COARSE_S = 0.25             # s; width of the average for the correlation
@@ -110,6 +110,14 @@ class ReferenceFit:
     effective_samples: float = math.nan
     budget: tuple[FactorLine, ...] = ()
     series: ReferenceSeries | None = None
+
+
+def scale_of_reference(stated_rel_sd: float | None) -> tuple[float, tuple[str, ...]]:
+    """Return the relative standard uncertainty of a sensor's scale, and a warning if it is assumed.
+
+    ``stated_rel_sd``: None if none is stated.
+    """
+    return (ASSUMED_REFERENCE_REL_SD, (_ASSUMED,)) if stated_rel_sd is None else (stated_rel_sd, ())
 
 
 def calibrate_reference(

@@ -81,7 +81,7 @@ def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:
 
 
 def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
-    from tdhil.calibration import calibrate_pairs
+    from tdhil.calibration import calibrate_pairs, scale_of_reference
     from tdhil.report import pairs_document
     from tdhil.session import drive_identity, drive_settings, log_of_calibration, read_pairs
 
@@ -90,7 +90,7 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
                          next_step=f"Such as: {_EXAMPLES['pairs']}")
     pairs = read_pairs(namespace.pairs)
     record = _one_log(namespace, "pairs") if namespace.logs else None
-    rel_sd, warnings = _reference_sd(namespace)
+    rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:
         found = replace(calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale), warnings=warnings)
@@ -106,28 +106,24 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     return document, record
 
 
-def _reference_sd(namespace: argparse.Namespace) -> tuple[float, tuple[str, ...]]:
-    """Return the standard uncertainty of the sensor's scale, as a share, and a warning if it is assumed."""
-    from tdhil.calibration import ASSUMED_REFERENCE, ASSUMED_REFERENCE_REL_SD
-
+def _reference_sd(namespace: argparse.Namespace) -> float | None:
+    """Return the stated standard uncertainty of the sensor's scale, as a share; None if none is stated."""
     stated: float | None = namespace.reference_sd
-    if stated is None:
-        return ASSUMED_REFERENCE_REL_SD, (ASSUMED_REFERENCE,)
-    if not 0.0 <= stated < 1.0:
+    if stated is not None and not 0.0 <= stated < 1.0:
         raise UsageError(f"{stated:g}: must be a share from 0 to below 1", where="--reference-sd")
-    return stated, ()
+    return stated
 
 
 def _reference(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.report import working
     from tdhil.session import find_by_reference, require_file
 
-    _reference_sd(namespace)           # refuses a value that is no share
+    stated = _reference_sd(namespace)
     record = _one_log(namespace, "reference")
     require_file(namespace.reference)
     with working("comparing both torques …"):
-        return find_by_reference(record, namespace.reference, namespace.column, namespace.at, namespace.reference_sd,
-                                 confidence), record
+        return find_by_reference(
+            record, namespace.reference, namespace.column, namespace.at, stated, confidence), record
 
 
 def _known_pipe(namespace: argparse.Namespace, confidence: float) -> _Found:

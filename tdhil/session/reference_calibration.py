@@ -34,7 +34,7 @@ def find_by_reference(
     ``columns``: columns of the trace, as `QUANTITY=NAME:UNIT`; ``at``: the sensor's shaft. Raises UsageError and
     CsvUnusable for a trace that is not usable, NothingRecorded for a log without motion.
     """
-    from tdhil.calibration import ASSUMED_REFERENCE, ASSUMED_REFERENCE_REL_SD, TorqueRecord, calibrate_reference
+    from tdhil.calibration import TorqueRecord, calibrate_reference, scale_of_reference
     from tdhil.recording import REFERENCE_FLAG, TIME_AND_TORQUE, parse_columns, read_reference
     from tdhil.report import reference_document
 
@@ -43,11 +43,7 @@ def find_by_reference(
     recording = record.recording
     sensor = read_reference(trace, parse_columns(columns or (), TIME_AND_TORQUE, REFERENCE_FLAG))
     ratio = recording.gear_ratio if at == "main" else 1.0
-    warnings = list(sensor.warnings)
-    rel_sd = reference_rel_sd
-    if rel_sd is None:
-        rel_sd = ASSUMED_REFERENCE_REL_SD
-        warnings.append(ASSUMED_REFERENCE)
+    rel_sd, assumed = scale_of_reference(reference_rel_sd)
     good = recording.fresh
     drive = TorqueRecord(recording.time_s[good], recording.torque_nm[good] - recording.torque_offset_nm,
                          recording.torque_resolution_nm)
@@ -65,7 +61,7 @@ def find_by_reference(
         found, {"file": str(trace), "sha256": digest, "at": at, "rel_sd": rel_sd}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
         date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
-        simulated=recording.simulated, warnings=warnings)
+        simulated=recording.simulated, warnings=[*sensor.warnings, *assumed])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
