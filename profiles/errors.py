@@ -19,7 +19,7 @@ _FLAG: Final = re.compile(r"(?<![\w-])--?[a-z][a-z-]*(?![\w-])")
 STOP_SAID: Final[Mapping[bool | None, str]] = {
     None: "tdhil stops the shaft.", True: "The shaft was stopped.", False: "Standstill was not confirmed.",
 }
-"""What tdhil did, by the outcome of the stop; None: it is not known yet."""
+"""Text on the shaft, by the outcome of the stop; None: it is not known yet."""
 
 
 class TdhilError(Exception):

@@ -131,8 +131,8 @@ def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
         raise TuningRefused(f"the drive's own impedance is {found.get('verdict')}: {found.get('reason')}",
                             where=f"--impedance {path}", next_step=str(found.get("advice", "")))
     if bool(document.get("simulated")) != bool(result.get("simulated")):
-        found, other = ("simulated", "real") if document.get("simulated") else ("real", "simulated")
-        raise UsageError(f"is of a {found} drive, and the result is of a {other} one", where=f"--impedance {path}",
+        kind, other = ("simulated", "real") if document.get("simulated") else ("real", "simulated")
+        raise UsageError(f"is of a {kind} drive, and the result is of a {other} one", where=f"--impedance {path}",
                          next_step="Measure both on the same drive; on a real one with --rig",
                          entry=MessageCode.WRONG_KIND_OF_FILE)
     if document["gear_ratio"] != result["gear_ratio"]:

@@ -327,9 +327,8 @@ class RunOptions:
     max_time_s: float | None = option(
         "--max-time", "run.max_time_s", group=Topic.MOTION, common=True, unit=TIME, metavar="TIME", api=True, ge=1e-6,
         le=1e7,
-        unset="what remains of `limits.time_s`", form=Form(
-            "Longest duration of stage 5, minutes", unit=MINUTE,
-            hint="by plan or limits"),
+        unset="what remains of `limits.time_s`",
+        form=Form("Longest duration of stage 5, minutes", unit=MINUTE, hint="by plan or limits"),
         help="longest duration of stage 5, such as 300 or 5min (default: its planned duration; with a tolerance, what "
         "remains of limits.time_s)",
         more="(on the command line `5min` too); longest duration of stage 5. Without a tolerance: its planned duration",

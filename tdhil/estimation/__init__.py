@@ -30,12 +30,12 @@ from tdhil.estimation.rough_estimates import (
 )
 from tdhil.estimation.samples import (
     STICK_SLIP_REGULAR as STICK_SLIP_REGULAR, STICK_SLIP_SHARE as STICK_SLIP_SHARE, Samples as Samples,
-        downhole_swing_rad_s as downhole_swing_rad_s,
+    downhole_swing_rad_s as downhole_swing_rad_s,
     Stretch as Stretch, excited_window as excited_window, repeats as repeats, stretches as stretches,
     usable_samples as usable_samples,
 )
-from tdhil.estimation.shared_filters import FittedTogether as FittedTogether, identify_together as identify_together
 from tdhil.estimation.setpoint_sampling import worst_share as worst_share
+from tdhil.estimation.shared_filters import FittedTogether as FittedTogether, identify_together as identify_together
 from tdhil.estimation.spectrum import (
     SpectralLine as SpectralLine, period_lines as period_lines, pooled_lines as pooled_lines,
 )

@@ -323,7 +323,7 @@ def require(who: Principal, role: Role | None, *, route: str, open_here: bool, c
             raise NotAllowed(f"{who.name} does not have the role {role}", where=route,
                              next_step=f"Ask a user with the role {role}" if who.known or not open_here else
                              "Users were added. Start the service again, with its other options too:"
-                              " tdhil serve --tls-cert FILE --tls-key FILE")
+                             " tdhil serve --tls-cert FILE --tls-key FILE")
         raise NotLoggedIn(
             "the login has ended" if who.known else "the client is not logged in", where=route,
             next_step="A request through a proxy, or with an unknown token, is refused" if open_here

@@ -410,9 +410,8 @@ class ServiceOperator:
     def confirm_speed(self, speed_rad_s: float, why: str, idle: Idle) -> None:
         raise PreflightRefused(
             f"no operator can confirm that the shaft turns at {speed_rad_s:.3g} rad/s ({why})", where="service",
-            next_step="Start this run at the rig: tdhil identify --rig FILE. Or name the drive's position object in"
-                      " the profile"
-            " (position). Or measure the speed, and then accept the unit of speed (--accept-speed-unit)",
+            next_step="Start this run at the rig: tdhil identify --rig FILE. Or name the drive's position object in the"
+            " profile (position). Or measure the speed, and then accept the unit of speed (--accept-speed-unit)",
             entry=MessageCode.SPEED_UNIT_NOT_SEEN,
         )
 

@@ -130,12 +130,10 @@ def _missing(profile: Profile, body: DraftBody, known: RigEntries) -> list[Draft
         found.append(DraftProblemView("address", page_text("Type the address of the drive. For a rig without a drive,"
                                                            " select Simulated.")))
     if profile.rated_torque_by_hand and not known.drive_data:
-        found.append(DraftProblemView("rated_torque_nm", page_text("Type it from the name plate. The drive does not"
-                                                                   " report"
-                                                                   " it.")))
-    found += [DraftProblemView(f"parameters.{one.name}", page_text("Read this value at the drive, and type it. The"
-                                                                   " drive"
-                                                                   " does not report it over the bus."))
+        found.append(DraftProblemView("rated_torque_nm", page_text(
+            "Type it from the name plate. The drive does not report it.")))
+    found += [DraftProblemView(f"parameters.{one.name}", page_text(
+                  "Read this value at the drive, and type it. The drive does not report it over the bus."))
               for one in profile.untold if one.name not in known.parameters]
     open_entries = [name for name, _ in doubtful(profile) if name not in known.accept_unverified]
     if open_entries:

@@ -32,7 +32,7 @@ CHECKLIST: Final = (
     "brake released", "pipe handler and people clear of the shaft",
     "hard-wired emergency stop tested and within reach (a stop by tdhil is no emergency stop)",
 )
-"""What a person checks before each motion."""
+"""Checklist of a person before each motion."""
 _UNWATCHED = "  [ ] an operator stays at that stop for the whole run: nothing else stops the shaft if this host fails\n"
 _SHARED = (
     "  [ ] every other client of this drive is switched off (PLC, panel, historian, gateway); an operator stays at\n"

@@ -161,6 +161,8 @@ def verify_steps(
 
     ``timing_sd_s``: standard uncertainty of the sample times; ``reference_filter_s``: known filter of the set speed.
     """
+    from scipy.special import stdtrit
+
     number, count = pairs.shape
     model = StepModel(case, program, period_s, count, timing_sd_s, reference_filter_s)
     mean: Reals = np.asarray(pairs.mean(axis=0), dtype=np.float64) if number else np.zeros(count)
@@ -197,8 +199,6 @@ def verify_steps(
     birge = max(1.0, squares / max(float(np.mean(left)), 1e-18))
     moves = scatter @ slopes @ inverse
     covariance = birge * moves.T @ moves / (number * (number - 1)) + inverse @ prior @ inverse
-    from scipy.special import stdtrit
-
     factor = float(stdtrit(number - 1, 1.0 - _TAIL))
     wider = (factor / _REACH) ** 2
     rows = _rows(model, _possible(theta, wider * covariance, cost, wider * birge), covariance, factor)
