@@ -134,11 +134,12 @@ def calibrate_pairs(
     effective = effective_degrees_of_freedom([(line.of_factor, line.degrees_of_freedom) for line in budget])
     factor = measured_value(slope, factor_sd, effective, confidence)
     refusal, assumed = "", normal_quantile(confidence) * scale_rel_sd
-    too_wide = not factor.half_width_share <= assumed
-    if too_wide and abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
+    plausible = abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd
+    too_wide = plausible and not factor.half_width_share <= assumed
+    if too_wide:
         refusal = (f"the pairs leave κ at {printed_share(factor.half_width_share)}, and the stated torque scale leaves"
                    f" ±{100 * assumed:.1f} %: measure larger torques, or more pairs")
-    elif not abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd:
+    elif not plausible:
         refusal = (f"the calibration factor would be {slope:.3g}: more than {100 * LARGEST_ERROR:.0f} % from 1 is no "
                    "error of a torque scale; check units, signs, and the shaft that the reference stands at")
     elif statistic.p_value < CONTRADICTED_P and abs(hysteresis or 0.0) < float(np.std(left)) and _bent(pairs, left):

@@ -125,6 +125,12 @@ def test_pairs_that_know_less_than_the_stated_scale_give_no_factor():
     assert not calibrate_pairs(few, scale_rel_sd=0.3).too_wide
 
 
+def test_a_scale_that_no_drive_has_is_not_said_to_be_too_uncertain():
+    found = calibrate_pairs(pairs(np.random.default_rng(3), factor=10.0), scale_rel_sd=0.001)
+    assert found.factor.half_width_share > 0.002
+    assert "no error of a torque scale" in found.refusal and not found.too_wide
+
+
 def test_a_sensor_that_reads_too_high_within_its_class_is_covered():
     """0.5 % is the limit of accuracy class 0.5; without the line of its scale, κ would exclude 1."""
     rng, torque = np.random.default_rng(6), np.linspace(0.0, 200.0, 40)
