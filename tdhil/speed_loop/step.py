@@ -108,7 +108,7 @@ def step_responses(plants: Sequence[LoopPlant], gains: PiGains, duration_s: floa
 
 
 def loop_responses(loops: Sequence[tuple[Reals, Reals, Reals]], durations_s: Sequence[float]) -> Reals:
-    """Return the response (loop, N) of each closed loop (A, B, C) to a unit step, over the duration of each loop."""
+    """Return the responses (loop, N) of closed loops (A, B, C) to a unit step, over their durations; inf: overflow."""
     from scipy.linalg import expm
 
     speeds = np.zeros((len(loops), _STEPS + 1))
@@ -119,12 +119,13 @@ def loop_responses(loops: Sequence[tuple[Reals, Reals, Reals]], durations_s: Seq
             a, b, _ = loops[row]
             whole[at, :-1, :-1], whole[at, :-1, -1] = a, b
             whole[at] *= durations_s[row] / _STEPS
-        move, out = expm(whole), np.array([loops[row][2] for row in rows])
-        state = np.zeros((len(rows), size + 1, 1))
-        state[:, -1] = 1.0
-        for at in range(1, _STEPS + 1):
-            state = move @ state
-            speeds[rows, at] = (out * state[:, :-1, 0]).sum(axis=1)
+        state = np.eye(size + 1)[:, -1:]
+        with np.errstate(over="ignore", invalid="ignore"):
+            move, out = expm(whole), np.array([loops[row][2] for row in rows])
+            for at in range(1, _STEPS + 1):
+                state = move @ state
+                speeds[rows, at] = (out * state[:, :-1, 0]).sum(axis=1)
+    speeds[~np.isfinite(speeds)] = np.inf
     return speeds
 
 

@@ -18,6 +18,7 @@ from tdhil.speed_loop import (
     step_responses,
 )
 from tdhil.speed_loop.loop import margins_of
+from tdhil.speed_loop.step import loop_responses
 
 pytest.importorskip("control")
 from tests.speed_loop import by_control
@@ -112,3 +113,12 @@ def test_width_and_depth_of_a_notch_are_those_of_its_response(over, under):
 
 def test_a_shallow_notch_has_no_width_of_3_db():
     assert NotchFilter(3.0, 0.8, 1.0).width_hz is None
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rate_1_s", [50.0, 1e5])       # the powers overflow; the matrix exponential itself does
+def test_a_loop_whose_response_overflows_never_settles(rate_1_s):
+    a, b, c = np.array([[rate_1_s, 1.0], [0.0, rate_1_s]]), np.array([1.0, -1.0]), np.array([1.0, 0.0])
+    (speed,) = loop_responses([(a, b, c)], [30.0])
+    figures = step_figures(np.linspace(0.0, 30.0, len(speed)), speed)
+    assert figures.overshoot_share == figures.settling_s == math.inf
