@@ -129,7 +129,6 @@ class SpeedSteps:
                     raise LimitHit(
                         f"speed {sample.speed_rad_s:.3f} rad/s after a step from {program.low_rad_s:.3f} to"
                         f" {program.high_rad_s:.3f} rad/s: the overshoot is above the limit of {allowed:.3g} rad/s",
-                        where=f"step at {sample.time_s:.1f} s",
-                        stops=True, next_step="Compare the gains in the drive with the tuned ones, and lower"
-                        " P",
+                        where=f"step at {sample.time_s:.1f} s", stops=True,
+                        next_step="Compare the gains in the drive with the tuned ones. If they agree, lower I",
                         entry=MessageCode.STEP_OVERSHOOTS)
