@@ -38,9 +38,8 @@ def main() -> None:
                 if kind.startswith("step") and len(found.changes) == 1:
                     (one,) = found.changes
                     placed += abs(one.at - at) <= 1
-                    if one.at == at:
-                        sized += 1
-                        covered += one.change.low <= size <= one.change.high
+                    sized += 1
+                    covered += one.change.low <= size <= one.change.high
             n = asked.histories
             print(f"{kind:12} {scatter:7.1f}   {seen / n:6.1%}   {steps / n:6.1%} {drifts / n:6.1%}"
                   + (f"   {placed / n:15.1%}   {covered}/{sized}" if kind.startswith("step") else ""))

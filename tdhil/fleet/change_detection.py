@@ -33,10 +33,16 @@ the steps, hᵀΣ⁻¹h and hᵀΣ⁻¹x are sums over the results after the ste
 not with its cube: 1000 results take about 0.03 s.
 
 One step or drift is searched at a time. After a step, both sides are searched again. Then each step is placed again
-between its neighbours, because the first was placed while the others were in the data. The sizes are estimated with all
-steps together: H has one column for each step, so that each segment between steps has its own level. (HᵀPH)⁻¹HᵀPx are
-the sizes, and (HᵀPH)⁻¹ is their covariance. The size of one step is the difference of the two levels beside it. A
-second step that was found does not falsify it; one that was missed does. Sizes are averaged over κ, as above.
+between its neighbours, because the first was placed while the others were in the data.
+
+**The size of a step** is its posterior between the neighbouring steps, over κ, τ and place j, with 0 for no change:
+
+    p(δ | x) = p_0 δ_0 + (1 − p_0) Σ w_κτj N(δ; m, v),    m = τ²b_j / (1 + τ²a_j),    v = τ² / (1 + τ²a_j),
+    w_κτj ∝ p(κ) p(x | κ, h_j, τ),    p_0 = p(none | x) / (p(none | x) + p(step | x)).
+
+The most probable place is also the place where chance makes the step large, and a step is only reported if it is large
+enough to be seen. A flat prior of δ at the most probable place therefore gives sizes that are too large. The size of a
+drift is the same, without the sum over places.
 """
 
 from __future__ import annotations
@@ -60,6 +66,9 @@ _NORMAL: Final = NormalDist()       # the quantile of tdhil.estimation would loa
 _SPREAD: Final = ((0.5, 0.10), (0.7, 0.20), (1.0, 0.40), (1.4, 0.15), (2.0, 0.10), (2.8, 0.05))     # κ, its prior
 _SIZES: Final = (2.0, 4.0, 8.0, 16.0, 32.0)            # τ in units of the median σ_k, each as likely
 _PASSES: Final = 8          # most searches for the places of several steps; two to three suffice
+_LEAST_SHARE: Final = 1e-6  # least weight of a component of a mixture, in units of the greatest
+_EXACT: Final = 1e-6        # resolution of a quantile of a mixture, in units of the least standard deviation
+_TINY: Final = 1e-300       # probabilities that are all zero by underflow stay zero
 _PRIOR: Final = {"none": 0.5, "step": 0.25, "drift": 0.25}
 
 
@@ -118,7 +127,8 @@ def difference(before: Measured, after: Measured, confidence: float = 0.95) -> D
 @dataclass(frozen=True)
 class ChangePoint:
     """A step between result ``at - 1`` and result ``at``. ``probability``: that of any step in the examined stretch;
-    ``here``: probability of this place, given a step. ``change`` as in `Difference`.
+    ``here``: probability of this place, given a step. ``change``: median and interval of the size, over all places of
+    this step, and with 0 for no change.
     """
 
     at: int
@@ -169,12 +179,11 @@ def history(results: Sequence[Measured], confidence: float = 0.95) -> History:
     whole = _evidence(known)
     drifts = whole.none < ALARM and whole.drift > whole.step
     found = [] if drifts or whole.none >= ALARM else _placed(known, _steps(known, 0))
-    sizes = _sizes(known, [one.at for one in found])
-    changes = tuple(ChangePoint(one.at, one.probability, one.here, _size(mean, deviation, confidence, relative))
-                    for one, (mean, deviation) in zip(found, sizes, strict=True))
+    changes = tuple(ChangePoint(one.at, one.probability, one.here, one.size.change(confidence, relative))
+                    for one in found)
     return History(
         whole.none, whole.step, whole.drift, changes,
-        _size(whole.drift_size, whole.drift_sd, confidence, relative) if drifts else None, relative,
+        whole.drift_size.change(confidence, relative) if drifts else None, relative,
     )
 
 
@@ -231,13 +240,58 @@ class _Inverse:
 
 
 @dataclass(frozen=True)
+class _SizePosterior:
+    """Posterior of a size: 0 with probability ``zero``, else a mixture of normal distributions.
+
+    ``share``, ``mean``, ``sd``: (components,).
+    """
+
+    zero: float
+    share: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+
+    @classmethod
+    def of(cls, zero: float, log_share: FloatArray, mean: FloatArray, variance: FloatArray) -> _SizePosterior:
+        """Return the mixture of components of any shape. Those without influence on an interval are left out."""
+        share = np.exp(log_share - log_share.max())
+        kept = share > _LEAST_SHARE
+        return cls(zero, (1.0 - zero) * share[kept] / share[kept].sum(), mean[kept], np.sqrt(variance[kept]))
+
+    def below(self, size: float) -> float:
+        """Return the probability of a smaller size."""
+        components = zip(*(each.tolist() for each in (self.share, self.mean, self.sd)), strict=True)
+        return self.zero * (size > 0.0) + float(
+            sum(share * _NORMAL.cdf((size - mean) / sd) for share, mean, sd in components))
+
+    def quantile(self, probability: float) -> float:
+        """Return the size that is not exceeded with this probability, by bisection."""
+        if 0.0 <= probability - self.below(0.0) <= self.zero:
+            return 0.0
+        reach = -_NORMAL.inv_cdf(0.5 * min(probability, 1.0 - probability))
+        low, high = float((self.mean - reach * self.sd).min()), float((self.mean + reach * self.sd).max())
+        while high - low > _EXACT * float(self.sd.min()):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.below(middle) < probability else (low, middle)
+        return 0.5 * (low + high)
+
+    def change(self, confidence: float, relative: bool) -> Difference:
+        """Return the median with the interval of equal tails."""
+        out = math.expm1 if relative else float
+        middle, low, high = (out(self.quantile(0.5 + side * confidence)) for side in (0.0, -0.5, 0.5))
+        negative = self.below(0.0)
+        sign = max(negative, 1.0 - self.zero - negative)
+        return Difference(middle, low, high, confidence, relative, True, sign)
+
+
+@dataclass(frozen=True)
 class _ChangeEvidence:
     none: float
     step: float
     drift: float
     places: FloatArray          # probability of each place of a step: before result 1, 2, …
-    drift_size: float
-    drift_sd: float
+    step_size: _SizePosterior
+    drift_size: _SizePosterior
 
 
 def _after(values: FloatArray) -> FloatArray:
@@ -251,77 +305,40 @@ def _evidence(known: _Series) -> _ChangeEvidence:
     span = time[-1] - time[0]
     rise = (time - time[0]) / span if span > 0.0 else np.arange(n) / (n - 1.0)
     sizes = median(known.sd) * np.array(_SIZES)                # np.median loads numpy.ma: 40 ms
-    weights, ratios, means, variances = [], [], [], []
+    squares = sizes[:, None] ** 2                              # τ²
+    logs, each_log, means, variances = [], [], [], []
     for spread, prior in _SPREAD:
         inverse = _Inverse.of(known, spread)
         weight, scaled = inverse.weight, inverse.scaled
         ones, of_x, of_rise = inverse.times(np.column_stack((np.ones(n), x, rise))).T
         total = float(ones.sum())
         misfit = float(x @ of_x - of_x.sum() ** 2 / total)
-        weights.append(math.log(prior) + 0.5 * (inverse.log_det - math.log(total) - misfit))
+        logs.append(math.log(prior) + 0.5 * (inverse.log_det - math.log(total) - misfit))
         tails = _after(scaled)
         own = np.append(_after(weight) - np.sum((tails @ inverse.inner) * tails, axis=1), rise @ of_rise)       # hᵀΣ⁻¹h
         level = np.append(_after(ones), rise @ ones)                                                    # hᵀΣ⁻¹1
         a = own - level**2 / total
         b = np.append(_after(of_x), rise @ of_x) - level * of_x.sum() / total
-        gain = 1.0 + np.outer(sizes**2, a)
-        log_ratio = -0.5 * np.log(gain) + 0.5 * np.outer(sizes**2, b**2) / gain
-        top = log_ratio.max(axis=0)
-        ratios.append(top + np.log(np.exp(log_ratio - top).mean(axis=0)))
-        means.append(b[-1] / a[-1])
-        variances.append(1.0 / a[-1])
-    # p(x | model), averaged over κ; all of them multiplied by the same factor
-    base = max(weights)
-    none = sum(math.exp(one - base) for one in weights)
-    by_spread = np.array([weight - base + ratio for weight, ratio in zip(weights, ratios, strict=True)])
-    top = by_spread.max(axis=0)
-    log_each = top + np.log(np.exp(by_spread - top).sum(axis=0))
-    highest = max(math.log(none), float(log_each.max()))
-    each = np.exp(log_each - highest)
-    p_none = _PRIOR["none"] * math.exp(math.log(none) - highest)
+        gain = 1.0 + squares * a
+        each_log.append(logs[-1] - math.log(len(sizes)) + 0.5 * (squares * b**2 / gain - np.log(gain)))
+        means.append(squares * b / gain)
+        variances.append(squares / gain)
+    # (κ, τ, shape): p(x, κ, τ | shape of the change), all multiplied by the same factor; the last shape is the drift
+    by_size, mean, variance = (np.array(values) for values in (each_log, means, variances))
+    highest = max(*logs, float(by_size.max()))
+    each = np.exp(by_size - highest).sum(axis=(0, 1))
+    p_none = _PRIOR["none"] * sum(math.exp(one - highest) for one in logs)
     p_steps = _PRIOR["step"] * each[:-1] / (n - 1.0)
     p_drift = _PRIOR["drift"] * float(each[-1])
-    whole = p_none + float(p_steps.sum()) + p_drift
-    posterior = np.exp(by_spread[:, -1] - log_each[-1])        # posterior of κ, with a drift
-    drift_size, drift_sd = _averaged(posterior, np.array(means), np.array(variances))
-    places = p_steps / max(float(p_steps.sum()), 1e-300)
+    p_step = float(p_steps.sum())
+    whole = p_none + p_step + p_drift
+    step_size, drift_size = (
+        _SizePosterior.of(p_none / max(p_none + p_change, _TINY), by_size[..., shapes], mean[..., shapes],
+                          variance[..., shapes])
+        for shapes, p_change in ((slice(-1), p_step), (-1, p_drift)))
     return _ChangeEvidence(
-        p_none / whole, float(p_steps.sum()) / whole, p_drift / whole, places, drift_size, drift_sd,
+        p_none / whole, p_step / whole, p_drift / whole, p_steps / max(p_step, _TINY), step_size, drift_size,
     )
-
-
-def _averaged(posterior: FloatArray, means: FloatArray, variances: FloatArray) -> tuple[float, float]:
-    """Return mean and standard deviation of a size, averaged over κ: (κ,) each."""
-    mean = float(posterior @ means)
-    return mean, math.sqrt(max(float(posterior @ (variances + means**2)) - mean**2, 0.0))
-
-
-def _sizes(known: _Series, places: Sequence[int]) -> list[tuple[float, float]]:
-    """Return size and standard deviation of each step, estimated with all steps of the history together.
-
-    ``places``: number of the first result behind each step, rising. The level of each segment has a flat prior. The
-    steps share the posterior of κ.
-    """
-    if not places:
-        return []
-    n, x = len(known.x), known.x
-    design = np.column_stack((np.ones(n), (np.arange(n)[:, None] >= np.array(places)).astype(float)))
-    logs, means, variances = [], [], []
-    for spread, prior in _SPREAD:
-        inverse = _Inverse.of(known, spread)
-        solved = inverse.times(design)
-        normal = design.T @ solved
-        covariance = np.linalg.inv(normal)
-        levels = covariance @ (solved.T @ x)
-        rest = x - design @ levels
-        misfit = float(rest @ inverse.times(rest[:, None])[:, 0])
-        logs.append(math.log(prior) + 0.5 * (inverse.log_det - np.linalg.slogdet(normal)[1] - misfit))
-        means.append(levels[1:])
-        variances.append(np.diag(covariance)[1:])
-    posterior = np.exp(np.array(logs) - max(logs))
-    posterior /= posterior.sum()
-    return [_averaged(posterior, mean, variance)
-            for mean, variance in zip(np.array(means).T, np.array(variances).T, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -329,6 +346,7 @@ class _FoundStep:
     at: int
     probability: float
     here: float
+    size: _SizePosterior
 
 
 def _steps(known: _Series, first: int) -> list[_FoundStep]:
@@ -338,11 +356,16 @@ def _steps(known: _Series, first: int) -> list[_FoundStep]:
     found = _evidence(known)
     if found.none >= ALARM or found.step <= found.drift:
         return []
+    one = _most_probable(found, first, found.step)
+    before = _steps(known.part(slice(one.at - first)), first)
+    after = _steps(known.part(slice(one.at - first, None)), one.at)
+    return [*before, one, *after]
+
+
+def _most_probable(found: _ChangeEvidence, first: int, probability: float) -> _FoundStep:
+    """Return the step of a stretch. ``first``: number of its first result."""
     at = int(np.argmax(found.places)) + 1
-    point = _FoundStep(first + at, found.step, float(found.places[at - 1]))
-    before = _steps(known.part(slice(at)), first)
-    after = _steps(known.part(slice(at, None)), first + at)
-    return [*before, point, *after]
+    return _FoundStep(first + at, probability, float(found.places[at - 1]), found.step_size)
 
 
 def _placed(known: _Series, found: Sequence[_FoundStep]) -> list[_FoundStep]:
@@ -357,10 +380,7 @@ def _placed(known: _Series, found: Sequence[_FoundStep]) -> list[_FoundStep]:
         for k, one in enumerate(steps):
             start = steps[k - 1].at if k else 0
             end = steps[k + 1].at if k + 1 < len(steps) else len(known.x)
-            if end - start >= LEAST:
-                seen = _evidence(known.part(slice(start, end)))
-                at = int(np.argmax(seen.places)) + 1
-                steps[k] = _FoundStep(start + at, one.probability, float(seen.places[at - 1]))
+            steps[k] = _most_probable(_evidence(known.part(slice(start, end))), start, one.probability)
         if [one.at for one in steps] == before:
             break
     return steps

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from tdhil.fleet import change_detection
 from tdhil.fleet.change_detection import Measured, difference, history
-from tests.fleet.drawn_histories import draw
+from tests.fleet.drawn_histories import KINDS, draw
 
 
 def one(value, rel_sd=0.004, drive="a", scale=0.03, time=0.0):
@@ -74,12 +74,18 @@ def test_the_evidence_is_that_of_the_densities(monkeypatch):
     found = change_detection._evidence(known)
     assert [found.none, found.step, found.drift] == pytest.approx(np.array(weights) / sum(weights), rel=1e-3)
     assert found.places == pytest.approx(np.array(each[:-1]) / sum(each[:-1]), rel=1e-3)
-    inverse = np.linalg.inv(covariance)
-    design = np.column_stack((np.ones(n), shapes[2]))
-    fit = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ x)
-    ((size, deviation),) = change_detection._sizes(known, [3])
-    assert size == pytest.approx(fit[1], rel=1e-3)
-    assert deviation == pytest.approx(math.sqrt(np.linalg.inv(design.T @ inverse @ design)[1, 1]), rel=1e-3)
+    # The size by regression with a prior of its own: mean and covariance of level and size for each place
+    inverse, posterior = np.linalg.inv(covariance), []
+    for share, shape in zip(found.places, shapes[:-1], strict=True):
+        design = np.column_stack((np.ones(n), shape))
+        of_fit = np.linalg.inv(design.T @ inverse @ design + np.diag([0.0, 1.0 / size**2]))
+        posterior.append((share, norm((of_fit @ design.T @ inverse @ x)[1], math.sqrt(of_fit[1, 1]))))
+    zero = found.none / (found.none + found.step)
+    for change in (-0.01, 0.001, 0.005, 0.01):
+        below = zero * (change > 0.0) + (1.0 - zero) * sum(share * one.cdf(change) for share, one in posterior)
+        assert found.step_size.below(change) == pytest.approx(below, rel=2e-3)
+        assert found.step_size.quantile(found.step_size.below(change)) == pytest.approx(change, rel=1e-3)
+    assert found.step_size.quantile(found.step_size.below(0.0) + 0.5 * zero) == 0.0
 
 
 def test_a_long_history_needs_no_matrix_of_its_length(monkeypatch):
@@ -117,6 +123,28 @@ def test_where_and_how_large_a_step_is():
     assert change.change.low < 0.05 < change.change.high
     assert change.probability > 0.999
     assert found.drift_change is None
+
+
+@pytest.mark.parametrize(("kind", "results"), [("step 1 %", 12), ("step 1 %", 20), ("step 2 %", 12)])
+def test_the_size_of_a_step_that_is_rarely_seen_covers(kind, results):
+    """Such a step is seen where chance makes it large. At its most probable place alone, 82 to 94 % covered."""
+    rng = np.random.default_rng([3, results, round(1000 * KINDS[kind])])
+    found = [history(draw(rng, kind, results)[0]).changes for _ in range(300)]
+    sizes = [steps[0].change for steps in found if len(steps) == 1]
+    assert len(sizes) > 40
+    assert sum(one.low <= KINDS[kind] <= one.high for one in sizes) >= 0.94 * len(sizes)
+
+
+def test_the_size_of_a_doubtful_step_includes_none():
+    """Where "no change" has more than half of what the interval leaves out, the interval reaches to 0."""
+    rng = np.random.default_rng(21)
+    doubtful = [(told, step) for told in (history(draw(rng, "step 1 %", 12)[0]) for _ in range(200))
+                for step in told.changes if len(told.changes) == 1]
+    assert any(told.none > 0.05 for told, _ in doubtful)
+    for told, step in doubtful:
+        zero = told.none / (told.none + told.step)
+        assert 0.0 in (step.change.low, step.change.high) or zero < 0.025
+        assert step.change.probability <= 1.0 - zero
 
 
 def test_two_steps_are_two():
