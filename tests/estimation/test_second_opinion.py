@@ -80,6 +80,21 @@ def test_its_own_interval_covers(usual, route):
     assert half.mean() < 0.04 * TRUE
 
 
+def test_the_lags_are_as_uncertain_at_any_confidence():
+    """Half an interval of 50 % is not 1.96 standard uncertainties: the delay counted as a third as uncertain."""
+    recording = usual_runs()[0]
+    samples = usable_samples(recording)
+    levels = levels_of(recording, samples)
+    half = {}
+    for confidence, quantile in ((0.95, 1.95996), (0.5, 0.67449)):
+        found = Finding(inertia=around(TRUE, 0.23 * quantile), speed_lag_s=around(0.25, 0.2 * quantile),
+                        torque_lag_s=around(0.0, 0.0), skew_s=around(0.0, 0.0))
+        case = Case(recording, Options(confidence=confidence), samples=samples, levels=levels)
+        estimate = second_opinions(case, found)[0].inertia_kg_m2
+        half[confidence] = 0.5 * (estimate.high - estimate.low) / quantile
+    assert half[0.5] == pytest.approx(half[0.95], rel=0.05)
+
+
 @pytest.mark.heavy
 def test_disagreement_by_chance_comes_once_in_a_hundred_runs(usual):
     said_no = sum((found[:, 3] == 0.0).astype(int) for found in usual.values())

@@ -37,7 +37,7 @@ from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
 from tdhil.estimation.result import OPEN, Estimate, Refusal, SecondOpinion, normal_quantile
 from tdhil.estimation.samples import acquisitions, usual_interval
 from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
-from tdhil.recording import FloatArray, Recording, SteppedSetpoint
+from tdhil.recording import FloatArray, SteppedSetpoint
 
 _FALSE_ALARM = 0.01       # share of sound runs with a false warning; more frequent warnings would be ignored
 _WORTH_A_FIT = 0.005
@@ -120,9 +120,9 @@ def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) 
         known = opinions[0].inertia_kg_m2
     if known is None:
         return None
-    sd = 0.5 * (known.high - known.low) / student_quantile(case.options.confidence, CERTAIN)
+    sd = _sd(case, known)
     finite = math.isfinite(known.value) and math.isfinite(sd)
-    return Inertia(known.value, sd, known_delay(case.recording, finding)) if finite else None
+    return Inertia(known.value, sd, _known_delay(case, finding)) if finite else None
 
 
 def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
@@ -151,7 +151,7 @@ def run_up_opinion(case: Case, finding: Finding) -> Fitted:
     raises.
     """
     speed, torque, skew = finding.speed_lag_s, finding.torque_lag_s, finding.skew_s
-    delay = known_delay(case.recording, finding)
+    delay = _known_delay(case, finding)
     if speed is None or torque is None or skew is None or not delay.known:
         return ()
     if case.levels is None or case.recording.has_drill_string or finding.compliant is not None:
@@ -241,7 +241,7 @@ def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tupl
 def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
     recording, levels = case.recording, case.levels
     density = Density(0.0, 0.0) if levels is None else Density(levels.density, levels.dof)
-    delay = known_delay(recording, finding)
+    delay = _known_delay(case, finding)
     spans = (case.samples.between(span.start_s, span.end_s) for span in found.calm)
     calm = [part for part in spans if len(part) > 1]
     resolution = Resolution(_rounding(recording.speed_resolution_rad_s, [part.speed_rad_s for part in calm]),
@@ -269,7 +269,7 @@ def _reading(case: Case, finding: Finding) -> ReadingShare:
     """
     recording = case.recording
     if recording.stepped_setpoint is None:
-        return reading_share(_loops(case, finding), _moment(finding), _least_lag_s(case, finding))
+        return reading_share(_loops(case, finding), _moment(case, finding), _least_lag_s(case, finding))
     share = reading_share((recording.stepped_setpoint,), None, _least_lag_s(case, finding))
     return ReadingShare(0.0, share.sd / math.sqrt(3.0))
 
@@ -282,11 +282,16 @@ def _least_lag_s(case: Case, finding: Finding) -> float:
     return 0.0 if prior.torque_lag_s is None else max(prior.torque_lag_s - 2.0 * prior.torque_lag_sd_s, 0.0)
 
 
-def _moment(finding: Finding) -> ReadMoment | None:
+def _sd(case: Case, estimate: Estimate) -> float:
+    """Return the standard uncertainty of an estimate: half its interval over the quantile of its confidence."""
+    return 0.5 * (estimate.high - estimate.low) / student_quantile(case.options.confidence, CERTAIN)
+
+
+def _moment(case: Case, finding: Finding) -> ReadMoment | None:
     skew, lag = finding.skew_s, finding.torque_lag_s
     if skew is None or lag is None or not (skew.finite and lag.finite):
         return None
-    return ReadMoment(skew.value, 0.5 * (skew.high - skew.low) / student_quantile(0.95, CERTAIN), max(lag.value, 0.0))
+    return ReadMoment(skew.value, _sd(case, skew), max(lag.value, 0.0))
 
 
 def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
@@ -294,7 +299,7 @@ def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
     period_s = usual_interval(case.samples.time_s)
     loops = usual_loops(period_s)
     reference, lag = reference_inertia(finding), finding.speed_lag_s
-    usual = reading_share(loops, _moment(finding), _least_lag_s(case, finding))
+    usual = reading_share(loops, _moment(case, finding), _least_lag_s(case, finding))
     if reference is None or max(abs(usual.value), usual.sd) < _WORTH_A_FIT:
         return loops
     lag_s = lag.value if lag is not None else case.recording.lag_prior.speed_lag_s
@@ -309,16 +314,15 @@ def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
     )
 
 
-def known_delay(recording: Recording, finding: Finding) -> Delay:
+def _known_delay(case: Case, finding: Finding) -> Delay:
     """Return the delay δ = τ_w − τ_T − skew: fitted, else stated, else unknown."""
     speed, torque, skew = finding.speed_lag_s, finding.torque_lag_s, finding.skew_s
     if speed is not None and torque is not None and skew is not None:
         value = speed.value - torque.value - skew.value
-        halves = [0.5 * (part.high - part.low) for part in (speed, torque, skew)]
-        sd = math.hypot(*halves) / student_quantile(0.95, CERTAIN)
+        sd = math.hypot(*(_sd(case, part) for part in (speed, torque, skew)))
         if math.isfinite(value) and sd < UNKNOWN_DELAY.sd_s:
             return Delay(value, sd, True)
-    prior = recording.lag_prior
+    prior = case.recording.lag_prior
     if prior.speed_lag_s is not None and prior.torque_lag_s is not None:
         sd = math.hypot(prior.speed_lag_sd_s, prior.torque_lag_sd_s, prior.skew_sd_s)
         return Delay(prior.speed_lag_s - prior.torque_lag_s, sd, True)
