@@ -717,6 +717,8 @@ class StopSequence:
             self._note(error)
             return False
         self._fed = False
+        # Some drives are not read until their watchdog acts, because reading feeds it.
+        self._enough_silent = max(self._enough_silent, self._loop.cycles(self._limits.watchdog_s + SILENT_S))
         self._trouble.append(
             f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s in spite of the quick stop: the host's sign"
             " of life was ended, so that the drive's own watchdog acts"
@@ -842,8 +844,9 @@ class StopSequence:
         return self._polls.only
 
     def _gets_slower(self, sample: Sample) -> bool:
-        """Return False if only polls show the shaft and it does not slow down: an armed watchdog must then act."""
-        if not (self._watched and self._polls.standing) or self._slowing.see(sample.time_s, sample.speed_rad_s):
+        """Return False if only polls, which feed an armed watchdog, show the shaft and it does not slow down."""
+        feeding = self._watched and self._fed and self._polls.standing
+        if not feeding or self._slowing.see(sample.time_s, sample.speed_rad_s):
             return True
         self._trouble.append(
             f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s without feedback of the cycle: the drive is"

@@ -327,6 +327,31 @@ def test_a_watchdog_that_takes_its_time_is_waited_for(world):
     assert here.stop_sequence().run().confirmed
 
 
+@pytest.mark.parametrize("read_by", ["polls", "nothing until the watchdog acts"])
+def test_the_watch_does_not_end_before_a_slow_watchdog_acts(world, read_by):
+    """A Modbus drive whose watchdog each request feeds is not read meanwhile. The watch ended after 1 s."""
+
+    class NotReported(Starved):
+        def exchange(self, command):
+            sample = super().exchange(command)
+            return sample._replace(fresh=False) if self.unfed_since_s is not None and not self.tripped else sample
+
+        @property
+        def tripped(self):
+            return self.state is PowerState.FAULT
+
+    class Polled(NotReported):
+        def poll(self):
+            return self.report()
+
+    kind = Polled if read_by == "polls" else NotReported
+    here = world(kind(driven=None, watchdog_s=3.0), replace(LIMITS, watchdog_s=3.0))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+
+
 def test_a_drive_that_somebody_else_feeds_too_is_asked_once(world):
     here = world(Starved(driven=None, rejects=True))
     here.turn(5.0)
