@@ -35,16 +35,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Read the three files, then run as every run."""
     from tdhil.cli.identify import run_with
-    from tdhil.cli.tune_inputs import read_result
+    from tdhil.cli.tune_inputs import calibration_factor, in_drive_torque, read_result
     from tdhil.session import evaluation_case, load_tuning
     from tdhil.soft_torque import load_string
 
     if "list" not in (namespace.fault or ()):
         tuning = load_tuning(namespace.controller)
-        rig = tuning["identified"] if namespace.result is None else read_result(namespace.result)
+        identified = tuning["identified"] if isinstance(tuning["identified"], dict) else {}
+        rig = identified if namespace.result is None else read_result(namespace.result)
         case = evaluation_case(
-            load_string(namespace.virtual_string), tuning, namespace.use, rig, str(namespace.controller),
-            own_loop=namespace.own_loop,
+            load_string(namespace.virtual_string), tuning, namespace.use, in_drive_torque(rig),
+            str(namespace.controller), own_loop=namespace.own_loop, torque_factor=calibration_factor(rig),
         )
         return run_with(namespace, case)
     return run_with(namespace)

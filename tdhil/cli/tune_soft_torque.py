@@ -58,7 +58,8 @@ if TYPE_CHECKING:
 
     Ends = tuple[Moved, Moved]
 
-IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
+IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio",
+              "torque_calibration")
 """Keys of the result that `tdhil evaluate` needs."""
 DEAD_TIME_PERIODS = 10.0
 """Reserve of dead time, in control periods."""

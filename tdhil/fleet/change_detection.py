@@ -280,8 +280,7 @@ class _SizePosterior:
         out = math.expm1 if relative else float
         middle, low, high = (out(self.quantile(0.5 + side * confidence)) for side in (0.0, -0.5, 0.5))
         negative = self.below(0.0)
-        sign = max(negative, 1.0 - self.zero - negative)
-        return Difference(middle, low, high, confidence, relative, True, sign)
+        return Difference(middle, low, high, confidence, relative, True, max(negative, 1.0 - self.zero - negative))
 
 
 @dataclass(frozen=True)
@@ -369,11 +368,7 @@ def _most_probable(found: _ChangeEvidence, first: int, probability: float) -> _F
 
 
 def _placed(known: _Series, found: Sequence[_FoundStep]) -> list[_FoundStep]:
-    """Return the steps, each with its place searched again between its neighbours, until no place changes.
-
-    The first steps were placed while the later ones were still in the data. A wrong place falsifies the sizes beside
-    it.
-    """
+    """Return the steps, each with its place searched again between its neighbours, until no place changes."""
     steps = list(found)
     for _ in range(_PASSES):
         before = [one.at for one in steps]

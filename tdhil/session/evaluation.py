@@ -46,11 +46,12 @@ def load_tuning(path: Path) -> Mapping[str, Any]:
 
 def evaluation_case(
     string: DrillString, tuning: Mapping[str, Any], use: str, rig: Mapping[str, Any], where: str, *,
-    own_loop: bool = False,
+    own_loop: bool = False, torque_factor: float = 1.0,
 ) -> EvaluationCase:
     """Return the tuned machine, its controller of kind ``use``, and the rig from the result document.
 
-    ``where``: the tuning's file. Raises UsageError if the files do not belong together or lack a needed value.
+    ``where``: the tuning's file. ``rig``: in the drive's own N·m; ``torque_factor``: as in `IdentifiedRig`. Raises
+    UsageError if the files do not belong together or lack a needed value.
     """
     from tdhil.soft_torque import EvaluationCase, IdentifiedRig, Prediction, SpeedController, TopDrive
 
@@ -77,7 +78,7 @@ def evaluation_case(
         low, high = lag.get("low"), lag.get("high")
         error_s = 0.5 * (high - low) if low is not None and high is not None else 0.0
         real = IdentifiedRig(inertia["value"], _value(rig["viscous_nm_s_rad"]), _value(rig["coulomb_nm"]),
-                             max(0.0, lag["value"]), rig["gear_ratio"])
+                             max(0.0, lag["value"]), rig["gear_ratio"], torque_factor)
         prediction = Prediction(
             use, _interval(cure), _interval(chosen["least_damping"]), tuple(tuning["string"]["modes_hz"]))
         return EvaluationCase(string, meant, SpeedController(**chosen["at_main_shaft"]), real, prediction, error_s,

@@ -107,7 +107,7 @@ class EvaluationCase:
 
     @property
     def scale(self) -> float:
-        """Factor κ from the intended machine's torque at its main shaft to the rig's torque at its motor."""
+        """Factor κ from the intended machine's torque at its main shaft to the rig's torque in the drive's own N·m."""
         return self.rig.inertia_kg_m2 * self.rig.gear_ratio / self.meant.inertia_kg_m2
 
     def plain(self) -> dict[str, Any]:
@@ -139,9 +139,9 @@ def check_virtual_string(case: EvaluationCase, period_s: float) -> None:
         raise EvaluationRefused(
             f"{rate_hz:.3g} cycles a second are too few for these gains: the sampled loop itself would oscillate",
             where="--rate", next_step=f"This controller needs {needed:.3g} cycles a second or more")
-    if case.own_loop and abs(case.scale * case.rig.gear_ratio - 1.0) > SAME_INERTIA:
+    if case.own_loop and abs(case.rig.main_shaft_inertia_kg_m2 / case.meant.inertia_kg_m2 - 1.0) > SAME_INERTIA:
         raise EvaluationRefused(
-            f"the rig has {case.rig.inertia_kg_m2 * case.rig.gear_ratio**2:.4g} kg·m² at the main shaft, "
+            f"the rig has {case.rig.main_shaft_inertia_kg_m2:.4g} kg·m² at the main shaft, "
             f"and the gains are for {case.meant.inertia_kg_m2:.4g}",
             where="--own-loop", next_step="Tune for this rig, or leave --own-loop out: tdhil then scales the torque")
     if case.rig.speed_lag_s > MOST_LAG_S or case.speed_lag_error_s > MOST_LAG_ERROR_S:

@@ -10,7 +10,8 @@ This module only computes; it has no bus and no clock.
 All quantities are at the main shaft of the intended machine (with its J, B and F_c), at its speeds and in its time. The
 rig may be another machine. Its torque is ``κ (T − τ)`` with κ = J_rig i/J and i = ω_motor/ω_main, so the rig has the
 same speeds at the same times. The difference between the rig's friction and the intended machine's is added. If the
-rig is the intended machine, κ = 1/i, and nothing is added.
+rig is the intended machine, κ = 1/i, and nothing is added. J_rig is in the drive's own N·m, in which it is commanded:
+after a torque calibration with factor c it is J/c, so that κ contains 1/c.
 
 **Observer.** The reported speed lags by the time constant τ_w that `identify` found. y is the reported speed, d an
 unknown torque, and F the known friction of the rig. The model is
@@ -170,13 +171,23 @@ SLOWEST_RAD_S, FASTEST_RAD_S = 3.0, 10.0
 
 @dataclass(frozen=True)
 class IdentifiedRig:
-    """The rig that turns, as `identify` found it, at the motor shaft."""
+    """The rig that turns, as `identify` found it, at the motor shaft: J and friction in the drive's own N·m.
+
+    ``torque_factor``: true torque over torque in the drive's own N·m, of a torque calibration that the drive does not
+    know; 1 without one. The speed controller of the intended machine and the string are in true N·m.
+    """
 
     inertia_kg_m2: float
     viscous_nm_s_rad: float
     coulomb_nm: float
     speed_lag_s: float
     gear_ratio: float = 1.0
+    torque_factor: float = 1.0
+
+    @property
+    def main_shaft_inertia_kg_m2(self) -> float:
+        """True J at the main shaft."""
+        return self.torque_factor * self.inertia_kg_m2 * self.gear_ratio**2
 
 
 class RotorObserver:
@@ -444,8 +455,9 @@ class HostLoop:
         period_s: float, torque_limit_nm: float, own_loop: bool = False,
     ) -> None:
         self._meant, self._rig, self._period_s, self._own_loop = meant, rig, period_s, own_loop
-        self.scale = 1.0 / rig.gear_ratio if own_loop else rig.inertia_kg_m2 * rig.gear_ratio / meant.inertia_kg_m2
-        """Factor κ from the intended machine's torque to the rig's torque."""
+        self.scale = (1.0 / (rig.gear_ratio * rig.torque_factor) if own_loop
+                      else rig.inertia_kg_m2 * rig.gear_ratio / meant.inertia_kg_m2)
+        """Factor κ from the intended machine's torque to the rig's torque in the drive's own N·m."""
         self._limit_nm = torque_limit_nm
         self._own = TopDrive(rig.inertia_kg_m2 * rig.gear_ratio / self.scale,
                              rig.viscous_nm_s_rad * rig.gear_ratio / self.scale, rig.coulomb_nm / self.scale)

@@ -103,6 +103,23 @@ def test_the_drives_own_loop_does_what_tune_says_of_its_gains(files):
     Shaft.read(files / "shaft.csv").assert_at_rest()
 
 
+@pytest.mark.heavy
+@pytest.mark.parametrize("own_loop", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_after_a_torque_calibration_the_string_acts_in_the_torque_of_the_drive(files, own_loop):
+    """The N·m of the drive are 10 % too small. Without the factor, the string and its controller were 9 % too weak."""
+    text = PLANT + "reporting:\n  torque_scale: 1.1\n"
+    if own_loop:
+        text = text.replace("_nm_s_rad: 6000.0", "_nm_s_rad: 1304.6").replace("_nm_rad: 4000.0", "_nm_rad: 1100")
+    plant_file(files, text)
+    document = json.loads((files / "tune.json").read_text())
+    document["identified"]["torque_calibration"] = {"factor": 1.0 / 1.1}
+    (files / "tune.json").write_text(json.dumps(document), encoding="utf-8")
+    done = evaluate(files, *(["--own-loop"] if own_loop else []))
+    assert (done.code, done.document["verdict"]) == (0, "as_predicted"), done.err
+    assert done.document["least_damping"]["value"] == pytest.approx(0.2256, abs=0.02)
+    assert done.document["loop"]["unknown_rms_nm"] < 50.0
+
+
 @pytest.mark.long
 def test_a_reported_torque_of_nine_tenths_of_the_commanded_one_is_not_as_predicted(files):
     """The loop itself does not use the reported torque, so all else goes as tune says."""
