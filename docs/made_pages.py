@@ -39,7 +39,8 @@ def command_line() -> str:
     out = [
         MADE + "# Command line",
         "",
-        "`tdhil COMMAND --help` shows the same at the terminal. `tdhil --version` shows the version.",
+        "`tdhil COMMAND --help` shows the options at the terminal. If a command has many, `--help-all` shows all of "
+        "them. `tdhil --version` shows the version.",
         "",
         "Options must be written out in full. Values may have a unit: `--tolerance 1%`, "
         "`--max-time 5min`, `--amplitude 20rpm`.",
@@ -92,7 +93,7 @@ def _command(title: str, parser: argparse.ArgumentParser, about: str, level: int
     if python_can:
         yield from (
             "Bus options of python-can: `-i`, `-c`, `-b`, `--fd`, `--data-bitrate`, `--timing`, "
-            "`--bus-kwargs`, as `tdhil scan --help` shows them.",
+            "`--bus-kwargs`, as `tdhil scan --help-all` shows them.",
             "",
         )
     for name, sub in _choices(parser).items():
@@ -199,8 +200,9 @@ MEANING = {
     8: ("**the stop is not confirmed**", "**Use the hard-wired emergency stop.**"),
     9: (
         "`not_identifiable` or `model_rejected`; `tdhil evaluate`: no critical speed, or not that of the string; "
-        "`tdhil severity`: the record says nothing of the string",
-        "Run the motion that the card names.",
+        "`tdhil severity`: the record does not show the torsional motion of the string",
+        "`not_identifiable`: run the motion that the card names. `model_rejected`: look at the graphs, and repeat the "
+        "run.",
     ),
     10: (
         "nothing can be recovered from a log, or nothing can be used of a trace",

@@ -632,7 +632,7 @@ class MessageCode(Enum):
     RUN_NOT_REACTING = (
         512, "The run's process does not respond",
         "The process was suspended, and does not read requests.",
-        "Use the hard-wired emergency stop. The drive's watchdog stops the shaft.")
+        "Use the hard-wired emergency stop. Do not rely on the drive's watchdog.")
     UPLOAD_WITHOUT_END = (
         513, "The drive sends an object that does not end",
         "A reply to an SDO request is longer than any object that tdhil reads, or its segments do not end in time.",

@@ -37,7 +37,8 @@ Each error, refusal, verdict and warning of tdhil has a code that stays the same
 the text in brackets. In JSON and in the API it has the key `code`. `tdhil explain TDH-412` shows its cause and cure
 offline.
 
-The hundreds of a code are the exit code of the process. This page is made from the code by
+The hundreds of a code are the exit code of the process; TDH-1300 ends with 130 or more. If standstill was not
+confirmed, TDH-800 follows the first message, and the exit code is 8. This page is made from the code by
 `tdhil explain --markdown`.
 """
 

@@ -34,7 +34,7 @@ from tdhil.version import __version__
 _GROUPS: Final = {
     "identify": {
         "identify": "move the shaft and identify its moment of inertia",
-        "stop": "stop a drive without a run; this is no emergency stop",
+        "stop": "stop a drive from outside of a run; this is no emergency stop",
     },
     "evaluate logs": {
         "replay": "identify again, from a log or from a CSV trace",

@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="send an e-mail for the same events, smtp[s]://user@host:port/recipient,recipient; the"
                         " password is in the file that TDHIL_MAIL_PASSWORD_FILE names, the sender in TDHIL_MAIL_FROM")
     parser.add_argument("--check-idle", action="store_true",
-                        help="before an upgrade: exit 0 if no run of --data is active and no tdhil here holds a drive,"
-                        " else 4; nothing is served")
+                        help="before an upgrade: exit 0 if no run of --data is active, each stop is confirmed or signed"
+                        " off, and no tdhil here holds a drive, else 4; nothing is served")
     parser.add_argument("--tls-cert", type=Path, metavar="PEM", help="the certificate, with its chain")
     parser.add_argument("--tls-key", type=Path, metavar="PEM", help="its key, without a password")
     parser.add_argument("--allowed-host", action="append", default=[], metavar="NAME",

@@ -282,7 +282,8 @@ class Rig(_Options):
     limits: Limits | None = Field(default=None, description="required unless the drive is simulated")
     gear: Gear = Gear()
     load: Annotated[Load, BeforeValidator(_load_of)] = Load()
-    make_up_torque_nm: Torque | None = Field(default=None, description="N·m at the motor; make-up torque of the joints")
+    make_up_torque_nm: Torque | None = Field(
+        default=None, description="N·m at the motor: make-up torque of the joints, divided by gear.ratio")
     torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; release rate of trapped torque")
     allow_reverse: bool = Field(default=False, description="allow reverse rotation; it can unscrew tool joints")
     drive_data: DriveData = DriveData()

@@ -66,8 +66,8 @@ CANDIDATES: tuple[CandidateModel, ...] = (
     CandidateModel(
         BEFORE_ECHO, FitRoute.LINES, model="inertia with the wave resistance of a pipe",
         data="all lines of the excitation", prior="the sizes of the pipe",
-        tried="the excitation is prbs, and the requested model may be a string", stands="always; the walk ends",
-        interval="profile of its fit",
+        tried="the excitation is prbs, and the requested model may be a string",
+        stands="always; no further row is tried", interval="profile of its fit",
         reason="a bit on bottom changes the echo from period to period; before the echo J does not depend on the bit",
         test="tests/estimation/test_before_echo.py::test_the_inertia_is_covered",
     ),
@@ -82,7 +82,7 @@ CANDIDATES: tuple[CandidateModel, ...] = (
         WEAK_LINES, FitRoute.LINES, model="rigid shaft", data="lines with speed or torque clear of the scatter",
         prior="as before", tried="a line that is weak in one signal contradicts the rigid shaft",
         stands="always; the load is then looked at, too", interval="as before",
-        reason="at a resonance one of the two signals nearly vanishes, and that line tells most",
+        reason="at a resonance one of the two signals nearly vanishes, and that line has the most information",
         test="tests/estimation/test_two_mass.py::test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line",
     ),
     CandidateModel(
@@ -99,18 +99,19 @@ CANDIDATES: tuple[CandidateModel, ...] = (
         test="tests/estimation/test_two_mass.py::test_auto_finds_two_masses_and_says_so",
     ),
     CandidateModel(
-        BENT_FRICTION, FitRoute.LINES, model="rigid shaft whose friction is bent over speed (Stribeck, fan)",
+        BENT_FRICTION, FitRoute.LINES, model="rigid shaft with nonlinear friction (Stribeck effect, fan)",
         data="the lines of the rigid shaft, and the mean torques", prior="as before",
         tried="the rigid shaft is rejected; with --model auto also if p is below 0.01 and no load oscillates",
         stands="the residuals allow it, and −2 ln L falls by more than 2 ln n",
-        interval="profiles of all shapes of the bend that the data allow",
-        reason="friction that is not straight leaks into the lines; the residuals contradict the shaft, but not its J",
+        interval="profiles of all friction curves that the data allow",
+        reason="nonlinear friction changes the spectral lines; the residuals contradict the shaft, but not its J",
         test="tests/estimation/test_nonlinear_friction.py::test_a_bend_is_seen_behind_short_lags",
     ),
     CandidateModel(
         KNOWN_PIPE, FitRoute.LOAD, model="string", data="lines with speed or torque clear of the scatter",
         prior="inertia and stiffness of the pipe, with their tolerance", tried="rig.yaml gives the sizes of the pipe",
-        stands="the residuals allow it, and the lines see its swing; the walk ends", interval=_FAMILY,
+        stands="the residuals allow it, and the lines show its torsional oscillation; no further row is tried",
+        interval=_FAMILY,
         reason="two equations more: four lines suffice for a string",
         test="tests/estimation/test_two_mass.py::test_what_is_known_of_a_pipe_counts_as_equations",
     ),
@@ -122,7 +123,8 @@ CANDIDATES: tuple[CandidateModel, ...] = (
     ),
     CandidateModel(
         TWO_MASSES, FitRoute.LOAD, model="two masses on a spring", data="the same lines", prior="none of the load",
-        tried="no compliant shaft is requested", stands="the residuals allow it, and the lines see its swing",
+        tried="no compliant shaft is requested",
+        stands="the residuals allow it, and the lines show its torsional oscillation",
         interval=f"{_FAMILY}; joined with that of the string beside it",
         reason="the simplest shaft that oscillates; a third of a light string seems to turn with the motor, so that J"
                " holds the values of both",
@@ -149,7 +151,8 @@ CANDIDATES: tuple[CandidateModel, ...] = (
     CandidateModel(
         BY_DIFFERENCE, FitRoute.LOAD, model="the rows before, again",
         data="the same lines; a line on which the mean speeds differ counts by this difference", prior="as before",
-        tried="no shaft is allowed, a line at the swing differs between the mean speeds, and half of the lines do not",
+        tried="no shaft is allowed, a line near the torsional resonance differs between the mean speeds, and half of"
+              " the lines do not",
         stands="a shaft is allowed now", interval="as before",
         reason="dry friction of the load changes sign at the slower mean speed only",
         test="tests/estimation/test_two_mass.py::"
@@ -160,7 +163,7 @@ CANDIDATES: tuple[CandidateModel, ...] = (
         data="frequencies up to 3 rad of the longer lag", prior=_OF_LAGS,
         tried="the record has frequencies beyond the narrow band", stands="J is bounded, and p is 0.01 or more",
         interval="the rows of the friction; joined with that of one-pole filters in the narrow band",
-        reason="half of what tells the lags stands beyond 1.2 rad",
+        reason="half of the information on the lags lies above 1.2 rad",
         test="tests/estimation/test_time_domain.py::test_what_stands_clear_beyond_the_lags_counts",
     ),
     CandidateModel(

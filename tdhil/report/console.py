@@ -70,7 +70,8 @@ def figures_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: 
 # The shaft may turn between the two entries. With a rigid shaft a smaller I raises the loop's phase at every frequency
 # and lowers its gain, so that the phase margin does not fall. If I falls, it comes first: the loop in between is the
 # present one with a smaller I. If I rises, P comes first: the loop in between is the new one with a smaller I.
-ENTRY_ORDER = ("If I becomes smaller, type it in first; otherwise type in P first. In the other order the loop may "
+ENTRY_ORDER = ("If I becomes smaller, type it in first; otherwise type in P first. With an integral time T_I = P/I: if "
+               "it becomes longer, type it in first; otherwise type in P first. In the other order the loop may "
                "oscillate between the two entries.")
 
 
