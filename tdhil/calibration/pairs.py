@@ -113,6 +113,8 @@ def calibrate_pairs(
 
     slope, intercept, covariance, chi2 = line_with_errors_in_both(
         pairs.reported_nm, pairs.reported_sd_nm, pairs.reference_nm, pairs.reference_sd_nm)
+    if slope == 0.0:
+        raise ValueError("the reference torque is the same in all pairs: check the sensor and its column")
     left = pairs.reference_nm - slope * pairs.reported_nm - intercept
     more = len(left) - 2
     up = np.array([one == UP for one in pairs.direction])

@@ -106,6 +106,10 @@ def calibrate_by_position(
     total = sum(weights)
     value = sum(weight * one.value for weight, one in zip(weights, stretches, strict=True)) / total
     bound = sum(weight * one.half_width for weight, one in zip(weights, stretches, strict=True)) / total
+    if value == 0.0:
+        return SpeedCalibration(
+            Verdict.MODEL_REJECTED, "the position shows no travel, although the drive reports speed",
+            "check the encoder and its coupling", "position")
     more = len(stretches) - 1
     scatter = 0.0
     if more:

@@ -61,8 +61,8 @@ def _add_torque(parser: argparse.ArgumentParser) -> None:
                         help="sizes and tolerances of the pipe below the drive, in the run of one log: its"
                         " characteristic impedance follows from them")
     parser.add_argument("--at", choices=("motor", "main"), default="motor",
-                        help="shaft to which the inertia, or the torque of --reference, refers; main: behind the gear"
-                        " (default motor)")
+                        help="shaft to which the inertia, or the torque of --reference or --pairs, refers; main: behind"
+                        " the gear (default motor)")
     add_option(parser, OPTION["confidence"])
     parser.add_argument("--plan", action="store_true",
                         help="from one log: the body and the duration of a run that reach --want")

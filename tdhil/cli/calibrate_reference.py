@@ -44,6 +44,9 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
     for name in unwanted:
         raise UsageError(f"does not go with --{kind.replace('_', '-')}", where=f"--{name.replace('_', '-')}",
                          next_step=f"Such as: {_EXAMPLES[kind]}")
+    if kind == "known_pipe" and namespace.at == "main":
+        raise UsageError("does not go with --known-pipe, whose file states the shaft", where="--at main",
+                         next_step=f"Such as: {_EXAMPLES[kind]}")
     require_new(namespace.save)
     report = ReportFile.of_files(namespace, getattr(namespace, kind), *namespace.logs)
     document, record = _KINDS[kind](namespace, confidence)
@@ -90,6 +93,12 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
                          next_step=f"Such as: {_EXAMPLES['pairs']}")
     pairs = read_pairs(namespace.pairs)
     record = _one_log(namespace, "pairs") if namespace.logs else None
+    if namespace.at == "main":
+        if record is None:
+            raise UsageError("needs a log, which has the gear ratio", where="--at main",
+                             next_step="Such as: tdhil calibrate torque run.mcap --pairs pairs.csv --at main")
+        ratio = record.recording.gear_ratio
+        pairs = replace(pairs, reference_nm=pairs.reference_nm / ratio, reference_sd_nm=pairs.reference_sd_nm / ratio)
     rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:

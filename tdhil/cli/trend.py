@@ -76,7 +76,7 @@ def run(namespace: argparse.Namespace) -> int:
         for note in document["notes"]:
             console.print(f"note: {note}", soft_wrap=True)
     if report is not None:
-        caption = "Each result with its 95 % coverage interval; a vertical line marks a change."
+        caption = "Each result with its repeatability; a vertical line marks a change."
         if document["rehearsed_faults"]:
             caption += " Hollow: a rehearsal of faults on the simulated drive."
         lines = (*(_followed_text(one) for one in document["quantities"]), *document["notes"])

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from tdhil.speed_loop import PiGains
 
 
+COVERAGE: Final = 0.95
+"""Coverage of the intervals from which a tuning is made."""
 _IDENTIFY_J: Final = "Identify again with a motion that identifies J"
 
 
@@ -30,14 +32,18 @@ def require_result(path: Path) -> None:
 
 
 def read_result(path: Path) -> Mapping[str, Any]:
-    """Return the document of a result: read from --json, or identified again from the log."""
+    """Return the document of a result: read from --json, or identified again from the log. Its intervals are of 95 %.
+
+    Raises UsageError for a file of another kind, and for a JSON document with intervals of another coverage: all
+    tuning draws from intervals of 95 %.
+    """
     from tdhil.session import is_log
 
     require_result(path)
     if is_log(path):
         from tdhil.api import identify, read
 
-        return identify(read(path)).document
+        return identify(read(path), confidence=COVERAGE).document
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -48,6 +54,12 @@ def read_result(path: Path) -> Mapping[str, Any]:
         raise UsageError("is JSON, but not a result of tdhil identify", where=str(path),
                          next_step="Write one with: tdhil identify --json > result.json",
                          entry=MessageCode.WRONG_KIND_OF_FILE)
+    inertia = document["inertia_kg_m2"]
+    stated = inertia.get("confidence", COVERAGE) if isinstance(inertia, dict) else COVERAGE
+    if abs(float(stated) - COVERAGE) > 1e-9:
+        raise UsageError(f"its intervals have a coverage of {100.0 * stated:g} %, and 95 % is needed", where=str(path),
+                         next_step="Name the log instead, or write it again: tdhil replay run.mcap --confidence 0.95"
+                         " --json > result.json", entry=MessageCode.WRONG_KIND_OF_FILE)
     return document
 
 

@@ -99,7 +99,8 @@ class Finding(ModelResult):
     data do not determine J (``refusal``). ``conditions``: conditions of J besides the torque scale. ``bent``: the
     friction of the model is nonlinear in speed. ``samples_used``: None for the number of the case. ``preface`` and
     ``remark``: text before and after the sentence on the model. ``reading_kg_m2``: additional error of J, on either
-    side, due to the moment at which torque is read. ``advice``: replaces the usual advice. ``contradiction``: evidence
+    side, due to the moment at which torque is read. ``speed_scale_share``: difference of J, as a share, if the angle of
+    the shaft is right and the reported speed is not. ``advice``: replaces the usual advice. ``contradiction``: evidence
     in the same run that contradicts J beyond chance; J is then not valid. ``reject_p``: the p-value below which the
     residuals contradict the model. ``curve``: the model over frequency; ``settled``: lines without residual
     oscillation; () for the lines of the case.
@@ -114,6 +115,7 @@ class Finding(ModelResult):
     preface: str = ""
     remark: str = ""
     reading_kg_m2: float = 0.0
+    speed_scale_share: float = 0.0
     advice: str = ""
     contradiction: Refusal = _NONE
     reject_p: float = REJECT_P

@@ -1,14 +1,16 @@
 """The conclusion drawn from a finding: verdict, reason and conditions. Only this module makes a verdict."""
 
+import math
 from dataclasses import replace
 
 from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.frequency_domain import widened_most_by_scale, with_total
-from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict
+from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict, normal_quantile
 
 _SHARPER = "identical filters on reported speed and torque, or known filters, would reduce the uncertainty further"
 _BY_SCALE = "a torque calibration (tdhil calibrate torque) reduces the uncertainty most"
+_BY_SPEED = "a correct scale of speed and position in the profile (tdhil calibrate speed) reduces the uncertainty most"
 
 
 def conclude(case: Case, finding: Finding) -> Identification:
@@ -20,9 +22,11 @@ def conclude(case: Case, finding: Finding) -> Identification:
     """
     inertia = _inertia(case, finding)
     verdict, reason, advice, entry = _judged(case.options, finding, inertia)
-    calibrate = verdict is Verdict.VALID and inertia is not None and widened_most_by_scale(inertia)
-    if calibrate:
-        advice = _BY_SCALE
+    by_scale = verdict is Verdict.VALID and inertia is not None and widened_most_by_scale(inertia)
+    of_speed, of_torque = _speed_scale_rel_sd(finding), case.recording.torque_scale_rel_sd
+    calibrate = by_scale and of_speed <= of_torque
+    if by_scale:
+        advice = _BY_SCALE if calibrate else _BY_SPEED
     warnings = (*case.warnings, *finding.warnings)
     stage = case.aborted
     if stage is not None:
@@ -37,20 +41,21 @@ def conclude(case: Case, finding: Finding) -> Identification:
         "verdict": verdict, "reason": reason, "advice": advice, "entry": entry, "inertia": inertia,
         "calibration_advised": calibrate,
         "warnings": warnings, "paper": case.paper, "torque_ratios": case.torque_ratios,
-        "torque_scale_rel_sd": case.recording.torque_scale_rel_sd,
+        "torque_scale_rel_sd": math.hypot(of_torque, of_speed),
         "periods_used": case.periods_used,
         "samples_used": case.samples_used if finding.samples_used is None else finding.samples_used,
     })
 
 
 def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
-    """Return the inertia with the torque scale's uncertainty in quadrature, and the uncertainty of the reading
-    moment added.
+    """Return the inertia with the uncertainty of the scales of torque and speed in quadrature, and the uncertainty of
+    the reading moment added.
     """
     if finding.inertia is None:
         return None
     conditions = ("torque scale exact", *finding.conditions)
-    total = with_total(finding.inertia, case.recording.torque_scale_rel_sd, case.options.confidence, conditions)
+    scale_rel_sd = math.hypot(case.recording.torque_scale_rel_sd, _speed_scale_rel_sd(finding))
+    total = with_total(finding.inertia, scale_rel_sd, case.options.confidence, conditions)
     half = finding.reading_kg_m2
     if half == 0.0:
         return total
@@ -61,6 +66,11 @@ def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
         low_total=max(total.low_total - half, 0.0),
         high_total=total.high_total + half,
     )
+
+
+def _speed_scale_rel_sd(finding: Finding) -> float:
+    """Return the relative standard uncertainty of the speed scale: the angle's contradiction is a 95 % interval."""
+    return finding.speed_scale_share / normal_quantile(0.95)
 
 
 def _judged(

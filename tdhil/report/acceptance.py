@@ -1,7 +1,8 @@
 """Acceptance: comparison of expected and identified values, judged by the interval. Pure: it reads the document.
 
 A quantity passes if its whole interval lies within the tolerance, and fails if its interval and the tolerance have no
-value in common. Otherwise the data do not decide.
+value in common. Otherwise the data do not decide. An interval with a coverage of less than 95 % decides nothing: a
+smaller confidence would make each quantity pass.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
 _INERTIAS: Final = ("inertia", "motor-inertia")
 _SETTINGS: Final = ("torque-limit",)
 """Settings in the N·m of the drive, which the document has in calibrated N·m."""
+
+
+LEAST_COVERAGE: Final = 0.95
 
 
 class AcceptanceVerdict(StrEnum):
@@ -120,6 +124,9 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
             if scope != own:
                 advice = "; expect motor-inertia instead" if scope == InertiaScope.MOTOR_SIDE else ""
                 other = f", which is {scope_text(scope)}, not {scope_text(own)}{advice}"
+        coverage = _coverage(document)
+        if low < high and coverage < LEAST_COVERAGE:
+            other += f", an interval with a coverage of {100.0 * coverage:g} %; acceptance needs 95 % or more"
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
         seen = f"{how} {with_interval(value, low, high, quantity.unit.symbol)}{other}"
     return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
@@ -132,6 +139,12 @@ def _at(place: Iterable[str], document: Part) -> Any:
     for key in place:
         part = part.get(key) if isinstance(part, Mapping) else None
     return part
+
+
+def _coverage(document: Part) -> float:
+    """Return the coverage of the document's intervals, as a share; that of the default without an inertia."""
+    stated = _at(("inertia_kg_m2", "confidence"), document)
+    return float(stated) if isinstance(stated, int | float) else LEAST_COVERAGE
 
 
 def _identified(name: str, part: Any, document: Part) -> tuple[float | None, float | None, float | None]:

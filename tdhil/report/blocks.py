@@ -24,6 +24,7 @@ from tdhil.report.card import (
     in_milliradians,
     inertia_text,
     minutes,
+    quoted,
     sentence,
 )
 from tdhil.report.document import banner, coded_reason, coded_warnings, rehearsal_rows, text_of, uploaded_rows
@@ -208,7 +209,7 @@ def _answer(document: Part) -> AnswerBox:
         lines.append(f"{100.0 * inertia['confidence']:g} % coverage interval, torque scale of the drive included")
         if shaft is not None:
             total = shaft["total_inertia_kg_m2"]
-            open_or = "left open by the data" if total is None else f"= {estimate_text(total, 'kg·m²')}"
+            open_or = "left open by the data" if total is None else f"= {estimate_text(quoted(total), 'kg·m²')}"
             lines.append(f"J_r is the motor side of a compliant shaft; J_r + J_L {open_or}")
         if document["gear_ratio"] != 1.0:
             lines.append(f"at the main shaft {inertia_text(document['inertia_main_shaft_kg_m2'], '_total')}")
@@ -261,7 +262,7 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Rep
         picture = Picture(
             "budget", partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
             "Half-width that each source alone contributes. The contributions add up approximately in squares. The "
-            "95 % coverage interval includes the torque scale; the repeatability does not.", names_left=True,
+            "coverage interval includes the torque scale; the repeatability does not.", names_left=True,
         )
         yield ReportSection(UNCERTAINTY_BUDGET.capitalize(), (picture, _budget(document)))
     if document["friction_curve"]:
@@ -366,7 +367,8 @@ def _numbers(document: Part) -> Iterator[Block]:
             add(BACKLASH.name, in_milliradians(play), BACKLASH.unit)
     if shaft is not None:
         for title, key, unit in COMPLIANT:
-            add(title, shaft[key], unit)
+            scaled = shaft[key] is not None and "low_total" in shaft[key]
+            add(f"{title}, torque scale included" if scaled else title, shaft[key], unit, "_total" if scaled else "")
     if rows:
         yield Table(_QUANTITIES, tuple(rows))
         yield Text("Intervals without the note 'torque scale included' take the torque scale as exact. Use them to "

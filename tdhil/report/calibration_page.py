@@ -35,6 +35,13 @@ def quantity(one: MeasuredValue | None, confidence: float) -> dict[str, Any] | N
     return None if one is None else {**asdict(one), "confidence": confidence}
 
 
+def band_of(factor: Part | None) -> tuple[float, str]:
+    """Return the coverage factor k of a calibration factor, and the label of a band with it; of 95 % without one."""
+    if factor is None:
+        return 1.96, "95 % band"
+    return float(factor["coverage_factor"]), f"{100.0 * factor['confidence']:g} % band"
+
+
 def run_name(run: Part) -> str:
     """Return the short name of a run's log; a file of an earlier version has only its path."""
     return str(run.get("name") or Path(run["log"]).name)

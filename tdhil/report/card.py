@@ -64,7 +64,7 @@ def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         return
     for title, key, unit in COMPLIANT:
         part = shaft[key]
-        yield title, "left open by the data" if part is None else estimate_text(part, unit)
+        yield title, "left open by the data" if part is None else estimate_text(quoted(part), unit)
 
 
 def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:

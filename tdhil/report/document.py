@@ -184,10 +184,10 @@ def result_document(
             "motor_inertia_kg_m2": None if found.inertia is None else {     # the result's own inertia, J_r
                 name: getattr(found.inertia, name) for name in ("value", "low_total", "high_total", "low", "high")
             },
-            "load_inertia_kg_m2": _estimate(shaft.load_inertia),
-            "total_inertia_kg_m2": _estimate(shaft.total_inertia),
-            "stiffness_nm_rad": _estimate(shaft.stiffness_nm_rad),
-            "damping_nm_s_rad": _estimate(shaft.damping_nm_s_rad),
+            "load_inertia_kg_m2": _scaled(shaft.load_inertia, found, recording),
+            "total_inertia_kg_m2": _scaled(shaft.total_inertia, found, recording),
+            "stiffness_nm_rad": _scaled(shaft.stiffness_nm_rad, found, recording),
+            "damping_nm_s_rad": _scaled(shaft.damping_nm_s_rad, found, recording),
             "resonance_hz": _estimate(shaft.resonance_hz),
             "antiresonance_hz": _estimate(shaft.antiresonance_hz),
             "covariance": None if shaft.covariance is None else asdict(shaft.covariance),

@@ -16,6 +16,7 @@ import numpy as np
 from profiles.quantities import printed_share
 from tdhil.report.blocks import Block, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
+    band_of,
     calibrated_item,
     date_and_signature,
     laboratory_page,
@@ -339,7 +340,7 @@ _DATA = {PAIRS: _pairs_data, REFERENCE: _reference_data, KNOWN_PIPE: _known_pipe
 
 
 def draw_pairs(figure: FigureBase, document: Part) -> None:
-    """Draw, above, the pairs, the line and its 95 % band (dotted: an exact torque scale); below, residuals by
+    """Draw, above, the pairs, the line and its band (dotted: an exact torque scale); below, residuals by
     direction.
     """
     pairs, line = document["pairs"], document["line"]
@@ -349,10 +350,11 @@ def draw_pairs(figure: FigureBase, document: Part) -> None:
     margin = 0.05 * float(np.ptp(x))
     at = np.linspace(float(x.min()) - margin, float(x.max()) + margin, 100)
     design = np.column_stack([at, np.ones_like(at)])
-    band = 1.96 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, np.array(line["covariance"]), design), 0.0))
+    k, label = band_of(document["calibration_factor"])
+    band = k * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, np.array(line["covariance"]), design), 0.0))
     fitted = line["slope"] * at + line["intercept_nm"]
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    top.fill_between(at, fitted - band, fitted + band, color=OURS, alpha=0.2, lw=0, label="95 % band")
+    top.fill_between(at, fitted - band, fitted + band, color=OURS, alpha=0.2, lw=0, label=label)
     top.plot(at, fitted, "-", color=OURS, lw=1.4, label=f"slope κ = {line['slope']:.4f}")
     top.plot(at, at, ":", color=QUIET, lw=1.2, label="exact torque scale")
     spread = np.hypot(y_sd, line["slope"] * x_sd)

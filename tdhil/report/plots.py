@@ -159,7 +159,7 @@ def draw_budget(figure: FigureBase, document: Part) -> None:
                    key=lambda line: float(line["half_width_kg_m2"]))
     axes = figure.subplots()
     halves = [line["half_width_kg_m2"] for line in lines]
-    colours = [QUIET if line["source"].startswith("torque scale") else OURS for line in lines]
+    colours = [QUIET if line["source"].startswith(("torque scale", "speed scale")) else OURS for line in lines]
     bars = axes.barh([line["source"] for line in lines], halves, color=colours)
     axes.bar_label(bars, [budget_figures(half, max(halves))[0] for half in halves], padding=4, fontsize="small")
     axes.margins(x=0.12)

@@ -13,6 +13,7 @@ from rich.text import Text as Words
 
 from tdhil.report.blocks import Block, Column, Picture, Report, ReportSection, Table, Text
 from tdhil.report.calibration_page import (
+    band_of,
     calibrated_item,
     date_and_signature,
     laboratory_page,
@@ -180,24 +181,25 @@ _ROUNDING = 1e-9
 
 def _picture(document: Part) -> Block:
     return Picture("bodies", partial(draw_calibration, document=document), 4.2,
-                   "Identified over known added inertia, in the drive's unit of torque; the line, its 95 % band, and"
-                   " the residuals.")
+                   "Identified over known added inertia, in the drive's unit of torque; the line, its coverage band,"
+                   " and the residuals.")
 
 
 def draw_calibration(figure: FigureBase, document: Part) -> None:
-    """Draw, above, the runs, the line and its 95 % band (dotted: an exact torque scale); below, residuals."""
+    """Draw, above, the runs, the line and its band (dotted: an exact torque scale); below, residuals."""
     runs, line = document["runs"], document["line"]
     added = np.array([run["added_kg_m2"] for run in runs])
     seen = np.array([run["reported_kg_m2"] for run in runs])
-    half = 1.96 * np.array([run["standard_uncertainty_kg_m2"] for run in runs])
+    k, label = band_of(document["calibration_factor"])
+    half = k * np.array([run["standard_uncertainty_kg_m2"] for run in runs])
     left = np.array([run["residual_kg_m2"] for run in runs])
     x = np.linspace(min(0.0, float(added.min())), 1.08 * float(added.max()), 100)
     y = line["intercept_kg_m2"] + line["slope"] * x
     covariance = np.array(line["covariance"])
     design = np.column_stack([np.ones_like(x), x])
-    band = 1.96 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, covariance, design), 0.0))
+    band = k * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, covariance, design), 0.0))
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    top.fill_between(x, y - band, y + band, color=OURS, alpha=0.2, lw=0, label="95 % band")
+    top.fill_between(x, y - band, y + band, color=OURS, alpha=0.2, lw=0, label=label)
     top.plot(x, y, "-", color=OURS, lw=1.4, label=f"slope 1/κ = {line['slope']:.4f}")
     top.plot(x, line["intercept_kg_m2"] + x, ":", color=QUIET, lw=1.2, label="exact torque scale")
     top.errorbar(added, seen, half, fmt="o", color=DARK, ms=5, capsize=3, lw=1.2, label="runs")

@@ -121,7 +121,7 @@ def conclude(
     said = (
         *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),
         *(CodedText(one, MessageCode.CALIBRATION_WARNING) for one in applied.warnings),
-        *run_warnings(run),
+        *(one for one in run_warnings(run) if not _repeated(one, identification.warnings)),
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
@@ -131,6 +131,13 @@ def conclude(
     document = result_document(identification, recording, run, log, calibrated=bool(applied.day))
     code = code_with(document["rehearsal"], _accepted(document["acceptance"], stands=stands))
     return Conclusion(identification, document, ExitCode(code))
+
+
+def _repeated(warning: str, later: Sequence[str]) -> bool:
+    """Return whether the identification has this warning, too: speed and angle are compared in each stage."""
+    entries = [one.entry for one in later if isinstance(one, CodedText)]
+    unlike = MessageCode.SPEED_UNLIKE_ANGLE
+    return isinstance(warning, CodedText) and warning.entry is unlike and unlike in entries
 
 
 def _accepted(acceptance: Mapping[str, Any] | None, *, stands: bool) -> ExitCode:

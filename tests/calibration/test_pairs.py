@@ -1,4 +1,4 @@
-"""Pairs of a reference sensor: York's line against scipy.odr, its coverage, hysteresis, and what is refused."""
+"""Pairs of a reference sensor: York's line compared with scipy.odr, its coverage, hysteresis, and refusals."""
 
 import json
 import re
@@ -6,10 +6,13 @@ import re
 import numpy as np
 import pytest
 
-from tdhil.calibration import TorquePairs, calibrate_pairs, line_with_errors_in_both
+from tdhil.calibration import MeasuredValue, TorquePairs, calibrate_pairs, line_with_errors_in_both
+from tdhil.cli import calibrate_reference
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.session import read_pairs
+from tdhil.report.calibration_page import band_of, quantity
+from tdhil.session import RunRecord, read_pairs
+from tests.estimation.reporting import recorded
 
 
 def pairs(rng, factor=0.95, offset=1.5, many=8, hysteresis=0.0, x_sd=1.0, y_sd=0.8):
@@ -69,7 +72,38 @@ def test_a_reference_that_is_curved_is_refused():
     assert "curved" in calibrate_pairs(bent).refusal
 
 
-def test_two_pairs_are_no_line():
+def test_a_reference_without_a_signal_is_an_error_of_use(tmp_path, capsys):
+    """The cable of the sensor is not plugged in: a slope of 0 ended with a traceback."""
+    path = tmp_path / "pairs.csv"
+    path.write_text(HEADER + "".join(f"{x},1,0,0.5,up\n" for x in (0, 50, 100, 200)))
+    assert main(["calibrate", "torque", "--pairs", str(path)]) == 2
+    assert "the same in all pairs" in capsys.readouterr().err
+
+
+def test_torques_at_the_main_shaft_are_divided_by_the_gear_ratio(tmp_path, capsys, monkeypatch):
+    """The option was ignored with --pairs. The ratio is in the log."""
+    path = tmp_path / "pairs.csv"
+    path.write_text(HEADER + "".join(f"{x},0.1,{1.1 * 0.95 * x},0.1,up\n" for x in (0, 50, 100, 200)))
+    words = ["calibrate", "torque", "--pairs", str(path), "--at", "main", "--json"]
+    assert main(words) == 2
+    assert "gear ratio" in capsys.readouterr().err
+    log_path = tmp_path / "run.mcap"
+    log_path.write_bytes(b"of which only the hash is read")
+    log = RunRecord(recorded(np.arange(10.0), np.ones(10), np.ones(10), gear_ratio=1.1, torque_scale_rel_sd=0.02), {}, str(log_path))
+    monkeypatch.setattr(calibrate_reference, "_one_log", lambda *_: log)
+    assert main([*words[:2], str(log_path), *words[2:]]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration_factor"]["value"] == pytest.approx(0.95)
+
+
+def test_the_band_of_few_pairs_has_their_coverage_factor():
+    """The scatter of three pairs has one degree of freedom: k is 12.7, and the band was drawn with 1.96."""
+    factor = quantity(MeasuredValue(0.95, 0.004, 1.0, 12.7, 0.9, 1.0), 0.95)
+    assert band_of(factor) == (12.7, "95 % band")
+    assert band_of({**factor, "confidence": 0.9, "coverage_factor": 6.3}) == (6.3, "90 % band")
+    assert band_of(None) == (1.96, "95 % band")
+
+
+def test_two_pairs_give_no_line():
     two = np.array([1.0, 2.0])
     with pytest.raises(ValueError, match="3 pairs"):
         line_with_errors_in_both(two, two, two, two)
@@ -83,7 +117,7 @@ HEADER = "reported_nm,reported_sd_nm,reference_nm,reference_sd_nm,direction\n"
     (HEADER + "1,1,x,1,up\n", "reference_nm is no number"), (HEADER + "1,0,1,1,up\n", "must be above 0"),
     (HEADER + "1,1,1,1,left\n", "neither up nor down"),
 ])
-def test_what_are_no_pairs(tmp_path, text, words):
+def test_invalid_pairs(tmp_path, text, words):
     path = tmp_path / "pairs.csv"
     path.write_text(text)
     with pytest.raises(UsageError, match=words):
@@ -107,8 +141,8 @@ def test_the_command_prints_a_card_and_a_document(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("many", [8, 80])
-def test_more_pairs_do_not_average_the_scale_of_the_sensor_out(many):
-    """All pairs share the sensor, and so its error of scale (GUM F.1.2.3)."""
+def test_more_pairs_do_not_reduce_the_uncertainty_of_the_sensor_scale(many):
+    """All pairs share the sensor and therefore its error of scale (GUM F.1.2.3)."""
     found = calibrate_pairs(pairs(np.random.default_rng(5), many=many), reference_rel_sd=0.003)
     assert found.factor.standard_uncertainty > 0.003 * found.factor.value
     (scale,) = (line for line in found.budget if line.source == "scale of the reference")
@@ -117,7 +151,7 @@ def test_more_pairs_do_not_average_the_scale_of_the_sensor_out(many):
     assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-9)
 
 
-def test_pairs_that_know_less_than_the_stated_scale_give_no_factor():
+def test_pairs_more_uncertain_than_the_stated_scale_give_no_factor():
     few = TorquePairs(np.array([0.0, 5.0, 10.0]), np.full(3, 1.0), np.array([0.0, 5.6, 11.0]), np.full(3, 0.5),
                       ("up",) * 3)
     found = calibrate_pairs(few)
@@ -125,14 +159,14 @@ def test_pairs_that_know_less_than_the_stated_scale_give_no_factor():
     assert not calibrate_pairs(few, scale_rel_sd=0.3).too_wide
 
 
-def test_a_scale_that_no_drive_has_is_not_said_to_be_too_uncertain():
+def test_an_implausible_scale_is_not_reported_as_too_uncertain():
     found = calibrate_pairs(pairs(np.random.default_rng(3), factor=10.0), scale_rel_sd=0.001)
     assert found.factor.half_width_share > 0.002
     assert "no error of a torque scale" in found.refusal and not found.too_wide
 
 
-def test_a_sensor_that_reads_too_high_within_its_class_is_covered():
-    """0.5 % is the limit of accuracy class 0.5; without the line of its scale, κ would exclude 1."""
+def test_a_sensor_error_within_its_class_is_covered():
+    """The limit of accuracy class 0.5 is 0.5 %. Without the budget line of its scale, κ would exclude 1."""
     rng, torque = np.random.default_rng(6), np.linspace(0.0, 200.0, 40)
     sd = 0.2 + 0.001 * torque
     found = calibrate_pairs(TorquePairs(torque + 0.2 * rng.standard_normal(40), np.full(40, 0.2),

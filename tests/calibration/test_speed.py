@@ -1,4 +1,4 @@
-"""``tdhil calibrate speed``: counted turns, the position of a log, coverage, what is refused, and the file."""
+"""``tdhil calibrate speed``: counted turns, position of a log, coverage, refusals, and the file."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import pytest
 from tdhil.calibration import CountedTurns, calibrate_by_position, calibrate_by_turns
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.estimation import AngleRatio, mean_speed
+from tdhil.estimation import AngleRatio, Verdict, mean_speed
 from tdhil.recording import Level
 from tdhil.report.calibration_page import scale_error
 from tdhil.session import RunRecord, TurnsCount, add_speed_calibration, speed_by_position, speed_by_turns
@@ -26,7 +26,7 @@ TORQUE = {"kind": "torque_calibration", "date": "2026-11-23T10:00:00+00:00", "dr
 
 
 def turning(seconds=120.0, lag=0.3, resolution=1e-3, scale=SCALE, position=True, last=None):
-    """A shaft about 4 rad/s, its lagged and rounded speed, and its angle in counts of 1/4096 turn."""
+    """Return a shaft at about 4 rad/s, its lagged and rounded speed, and its angle in counts of 1/4096 turn."""
     time = np.arange(round(seconds * 50.0)) / 50.0
     slow = 2.0 * math.pi * 0.2
     angle = 4.0 * time + 0.5 / slow * np.sin(slow * time)
@@ -66,7 +66,7 @@ def test_the_interval_of_a_count_covers():
     assert 0.93 * many <= covered <= 0.97 * many
 
 
-def test_too_few_turns_are_refused_with_the_number_that_would_do():
+def test_too_few_turns_are_refused_with_the_required_number():
     few = CountedTurns(10.0, 0.25, 31.4, 0.3, 2.0, 0.001)
     found = calibrate_by_turns(few, 0.005)
     assert found.factor is None and f"count {found.least_turns} turns" in found.advice
@@ -101,7 +101,14 @@ def test_a_log_without_a_position_is_refused():
         speed_by_position(record(replace(turning(), levels=())), 0.01, 0.95)
 
 
-def test_stretches_that_share_an_error_are_not_averaged_down():
+def test_a_position_that_does_not_move_is_refused():
+    """An encoder that is stuck on a count: a factor of 0 ended with a traceback."""
+    found = calibrate_by_position([AngleRatio("stage 2", 0.0, 0.001)], 0.01)
+    assert (found.verdict, found.factor) == (Verdict.MODEL_REJECTED, None)
+    assert "no travel" in found.reason
+
+
+def test_a_common_error_of_stretches_is_not_averaged_down():
     one, four = (calibrate_by_position([AngleRatio("stage 2", 0.97, 0.002)] * many, 0.1) for many in (1, 4))
     assert four.factor.standard_uncertainty == pytest.approx(one.factor.standard_uncertainty)
 
@@ -121,7 +128,7 @@ def test_turns_beside_a_log_count_its_mean_speed():
             speed_by_turns(replace(count, start_s=start, end_s=end), record(recording), 4.0, 0.05, 0.95)
 
 
-def test_a_hole_in_the_log_is_no_mean_speed():
+def test_a_gap_in_the_log_gives_no_mean_speed():
     recording = turning()
     fresh = recording.fresh & ~((recording.time_s > 50.0) & (recording.time_s < 51.0))
     assert mean_speed(replace(recording, fresh=fresh), 10.0, 110.0) is None
@@ -196,7 +203,7 @@ def test_a_file_that_cannot_be_written_has_its_code(tmp_path, capsys, monkeypatc
 
 @pytest.mark.parametrize(("text", "words"), [("no JSON", "is no JSON"), ("{}", "no calibration"),
                                              (json.dumps(TORQUE), "another drive: its serial is 17, and 23")])
-def test_a_file_of_another_kind_or_drive_is_left_as_it_is(tmp_path, text, words):
+def test_a_file_of_another_kind_or_drive_is_not_changed(tmp_path, text, words):
     path = tmp_path / "calibration.json"
     path.write_text(text)
     with pytest.raises(UsageError, match=words):

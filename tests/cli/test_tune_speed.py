@@ -1,4 +1,4 @@
-"""`tdhil tune speed` from a result's file: gains in the drive's units, warnings with codes, refusals, pictures."""
+"""`tdhil tune speed` from the file of a result: gains in the drive's units, warnings, refusals, pictures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.cli.test_tune import result as any_result
 
 
 def response():
-    """J = 15 kg·m² and B = 0.08 N·m·s/rad, as reported with a lag of the speed."""
+    """Return the response of J = 15 kg·m² and B = 0.08 N·m·s/rad with a lag of the reported speed."""
     lines = []
     for hertz in (0.1, 0.3, 1.0):
         s = 2j * math.pi * hertz
@@ -40,7 +40,7 @@ COMPLIANT = {"antiresonance_hz": interval(2.0, 1.95, 2.05), "resonance_hz": inte
 
 @pytest.fixture
 def tuned(tmp_path, capsys):
-    """Run it: (exit code, document or text, stderr)."""
+    """Run it; return (exit code, document or text, stderr)."""
     def run(*words, as_json=True, **said):
         path = tmp_path / "result.json"
         path.write_text(json.dumps(result(**said)), encoding="utf-8")
@@ -68,7 +68,17 @@ def test_gains_stand_at_the_motor_and_in_the_drives_parameters(tuned):
     assert document["steps"]["tuned"]["value"][-1] == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_terminal_fits_80_columns_and_says_what_to_type(tuned):
+@pytest.mark.parametrize("coverage", [0.5, 0.99])
+def test_intervals_of_another_coverage_are_refused(tuned, coverage):
+    """They were taken as those of 95 %: at 50 %, J was drawn with a third of its standard uncertainty."""
+    inertia = result()["inertia_kg_m2"]
+    code, document, _ = tuned(inertia_kg_m2={**inertia, "confidence": coverage})
+    assert code == 2
+    assert f"a coverage of {100 * coverage:g} %" in document["error"]["message"]
+    assert tuned(inertia_kg_m2={**inertia, "confidence": 0.95})[0] == 0
+
+
+def test_the_terminal_fits_80_columns_and_shows_the_parameters(tuned):
     code, text, _ = tuned("--inner-lags", "20ms", "10ms", "--dead-time", "3ms", "--profile", "abb/acs880-enhanced",
                           "--bandwidth", "0.8", as_json=False)
     assert code == 0
@@ -82,7 +92,7 @@ def test_the_terminal_fits_80_columns_and_says_what_to_type(tuned):
 
 @pytest.mark.parametrize("hertz", [1.0, 0.6, 0.8556, 1.0049])
 def test_the_bandwidth_that_the_warning_advises_ends_it(tuned, hertz):
-    """The bandwidth that is found is the requested one within rounding, such as 0.6000000000000127 Hz."""
+    """The bandwidth of the result equals the requested one within rounding, such as 0.6000000000000127 Hz."""
     lines = response()["lines"]
     lines[-1]["hertz"] = hertz
     words, said = ("--inner-lags", "20ms", "10ms", "--dead-time", "3ms"), {"frequency_response": {"lines": lines}}
@@ -157,7 +167,7 @@ PERCENT = {"gain": None, "integral": None, "units": ("percent_per_percent", "ms"
     ((), {"integral": None, "values": (40.0, None)}, None, "the drive did not report both gains"),
     ((), {"confidence": "unverified"}, (40.0, 30.0), "in units that the profile marks as unverified"),
 ])
-def test_gains_that_cannot_be_compared_say_why(tuned, words, said, gains, source):
+def test_gains_that_cannot_be_compared_give_the_reason(tuned, words, said, gains, source):
     code, document, _ = tuned(*words, speed_loop_present=reported(**said))
     assert code == 0
     found, text = present_in(document)
@@ -258,7 +268,7 @@ def test_a_j_that_may_include_the_string_is_warned_of(tuned):
     assert not any("string" in one for one in document["warnings"])
 
 
-def test_thin_present_gains_are_named_with_a_code(tuned):
+def test_present_gains_with_small_margins_are_reported_with_a_code(tuned):
     _, document, _ = tuned("--present", 400, 9000)
     assert document["controllers"][0]["failed"]
     assert "TDH-059" in document["warning_codes"]
@@ -271,7 +281,7 @@ def test_picture_and_page_are_written_and_nothing_is_overwritten(tuned, tmp_path
     assert tuned("--plot", picture, "--report", page, "--present", 40, 30)[0] == 0
     drawn = picture.read_text(encoding="utf-8")
     assert drawn.count("<svg") == 1
-    parts = re.findall(r"<text[^>]*>([^<]*)</text>|<!-- (.*?) -->", drawn, re.DOTALL)      # text, or shapes of letters
+    parts = re.findall(r"<text[^>]*>([^<]*)</text>|<!-- (.*?) -->", drawn, re.DOTALL)      # text, or letter outlines
     said = html.unescape(" ".join(text or beside for text, beside in parts))
     for graph in ("open_loop", "step"):             # a line of help below each
         assert " ".join(said.split()).count(GRAPHS[graph].good[:40]) == 1
@@ -282,7 +292,7 @@ def test_picture_and_page_are_written_and_nothing_is_overwritten(tuned, tmp_path
 
 
 def test_the_gains_of_a_calibrated_result_are_in_the_drive_s_own_torque(tuned):
-    """The drive knows no calibration: with T = κ T_drive, (J/κ) ω' = T_drive is the shaft that its controller sees."""
+    """The drive does not know the calibration κ. With T = κ T_drive, its controller sees (J/κ) ω' = T_drive."""
     _, plain, _ = tuned()
     factor = 1.1
     scaled = {name: {key: factor * value if isinstance(value, float) and key != "confidence" else value

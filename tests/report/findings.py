@@ -1,4 +1,4 @@
-"""Results made by hand, with every part filled or every part missing, and a recording to go with them."""
+"""Results made by hand, complete or with every part missing, and a recording for them."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ RUN = {
     "bench": {"name": "Hall B", "load": "string", "limits": {"torque_nm": 400.0, "speed_min_rad_s": 0.5,
                                                              "speed_max_rad_s": 10.0}},
 }
-"""The configuration of a run, with what a drive or a person may write into it."""
+"""Configuration of a run, with texts of a drive or a user."""
 
 
 def around(value, half):
@@ -38,7 +38,7 @@ def around(value, half):
 
 
 def full():
-    """A valid result of a compliant shaft; one cross-check agrees, one does not."""
+    """Return a valid result of a compliant shaft; one cross-check agrees, one does not."""
     points = ((2.9, 83.1, 1.5), (3.6, 88.8, 0.8), (5.5, 104.5, 2.8), (7.0, 116.2, 0.8))
     return Identification(
         verdict=Verdict.VALID,
@@ -75,13 +75,13 @@ def full():
 
 
 def bare():
-    """A refusal with nothing but its reason."""
+    """Return a refusal with its reason only."""
     return Identification(
         verdict=Verdict.NOT_IDENTIFIABLE, reason="12 samples are no record", advice="record for longer")
 
 
 def open_sided():
-    """Estimates whose intervals are open, or open to the point of none."""
+    """Return estimates whose intervals are open on one side or on both."""
     everything = full()
     return replace(
         everything, verdict=Verdict.VALID_WIDE, speed_lag_s=Estimate(0.4, 0.1, float("inf")),

@@ -1,4 +1,4 @@
-"""Expected against identified: pass, fail or cannot tell by the interval, and what is off in words."""
+"""Acceptance of expected values: pass, fail or undecided by the interval, and deviations in words."""
 
 from dataclasses import replace
 
@@ -39,13 +39,24 @@ def test_a_machine_as_expected_passes():
     assert {one["verdict"] for one in found["quantities"]} == {"pass"}
 
 
+@pytest.mark.parametrize("changed", [{}, {"inertia": 135.0}])
+def test_intervals_of_less_than_95_percent_decide_nothing(changed):
+    """With --confidence 0.5, a run passed that cannot tell at 95 %."""
+    narrow, wide = document(**changed), document(**changed)
+    narrow["inertia_kg_m2"]["confidence"], wide["inertia_kg_m2"]["confidence"] = 0.5, 0.99
+    found = judged(narrow)
+    assert found["verdict"] == "cannot tell"
+    assert all("a coverage of 50 %" in one["text"] for one in found["quantities"])
+    assert judged(wide)["verdict"] == judged(document(**changed))["verdict"] != "cannot tell"
+
+
 @pytest.mark.parametrize(("changed", "name", "words"), [
     ({"inertia": 135.0}, "inertia", "moment of inertia J is 1.3 times"),
     ({"speed_lag": 1.2}, "speed-lag", "lag of the reported speed is 3 times the expected value: the speed filter"),
     ({"coulomb": 90.0}, "coulomb", "Coulomb friction T_c is 1.5 times"),
     ({"viscous": 16.0}, "viscous", "viscous friction B is 2 times"),
 ])
-def test_one_thing_that_is_off_is_named_and_no_other(changed, name, words):
+def test_a_single_deviation_is_named_and_no_other(changed, name, words):
     found = judged(document(**changed))
     assert found["verdict"] == "fail"
     assert [one["name"] for one in found["quantities"] if one["verdict"] == "fail"] == [name]
@@ -114,7 +125,7 @@ PRESENT = {"gain_nm_s_rad": 250.0, "integral_nm_rad": 125.0, "filter_s": 0.02, "
 
 
 def test_the_gains_that_the_drive_reports_are_judged_if_none_was_measured():
-    """`--impedance` is not open to the browser: there, the gains read in preflight are what can be judged."""
+    """`--impedance` is not available in the browser, so the gains read in preflight are judged there."""
     expected = {"gain": (250.0, 5.0), "integral-gain": (200.0, 10.0)}
     found = judged({**document(), "speed_loop_present": PRESENT}, expected)
     assert [one["verdict"] for one in found["quantities"]] == ["pass", "fail"]
@@ -185,13 +196,13 @@ def test_a_value_with_its_tolerance(name, text, value, tolerance):
     ("inertia=104", "tolerance"), ("mass=1±1", "no quantity is called"), ("inertia", "NAME=VALUE"),
     ("inertia=104±0", "above 0"), ("inertia=104 s±1", "kg"),
 ])
-def test_what_is_none_is_refused_by_name(given, words):
+def test_invalid_expectations_are_refused_by_name(given, words):
     with pytest.raises(UsageError, match="--expect") as caught:
         expectations_of({}, (given,))
     assert words in str(caught.value)
 
 
-def test_rig_yaml_states_them_and_the_command_line_goes_before(tmp_path):
+def test_rig_yaml_states_them_and_the_command_line_takes_precedence(tmp_path):
     rig = loaded_rig(tmp_path, "acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: 0.4 s ± 50 ms\n")
     found = expectations_of(rig.acceptance, ("inertia=100±1",))
     assert [(one.name, one.value) for one in found] == [("inertia", 100.0), ("speed-lag", 0.4)]
@@ -199,7 +210,7 @@ def test_rig_yaml_states_them_and_the_command_line_goes_before(tmp_path):
         loaded_rig(tmp_path, "acceptance:\n  inertia: 104 ± 5 %\n  speed-lag: soon\n")
 
 
-def test_it_stands_in_document_and_card_and_a_log_may_say_anything():
+def test_it_is_in_document_and_card_for_any_content_of_the_log():
     run = {**RUN, "acceptance": [{"name": "inertia", "value": 50.0, "tolerance": 1.0}, {"name": "x"}, 7]}
     assert len(expectations_in(run)) == 1 and expectations_in({"acceptance": 7}) == ()
     found = result_document(full(), recording(), run, "run.mcap")

@@ -1,4 +1,4 @@
-"""The result card: eighty columns, every part where there is one, nothing invented where there is none."""
+"""Result card: eighty columns, every available part, and no invented values."""
 
 import io
 import re
@@ -49,7 +49,7 @@ def test_every_part_is_shown():
         "J, 95 % interval       104.0 (99.9 to 108.1) kg·m²  ±4.0 %",
         "repeatability          104.00 (103.55 to 104.45) kg·m²  ±0.44 %, this drive",
         "SIMULATED", "motor's side, J_r", "J_L behind the spring",
-        "130.0 (128.0 to 132.0) kg·m²", "500 (480 to 520) N·m/rad", "left open by the data",
+        "130.0 (124.5 to 135.5) kg·m²", "500 (471 to 529) N·m/rad", "left open by the data",
         "2.90 rad/s: 83.1 ± 1.5", "7.00 rad/s: 116.20 ± 0.80",
         "130.6 (128.3 to 132.9) kg·m²  agrees, speed change", "DOES NOT AGREE, coast-down",
         "of torque or speed: 29 % or more would show",
@@ -57,13 +57,13 @@ def test_every_part_is_shown():
         "time offset", "! friction <b>bends</b> & more",
     ):
         assert wanted in card, wanted
-    # the one to quote leads
+    # the interval to quote comes first
     assert card.index("99.9 to 108.1") < card.index("103.55 to 104.45")
     # the largest source first
     assert card.index("torque scale         ") < card.index("noise  ") < card.index("lags  ")
 
 
-def test_where_the_torque_scale_is_exact_there_is_one_interval():
+def test_with_an_exact_torque_scale_there_is_one_interval():
     exact = replace(full(), inertia=replace(full().inertia, low_total=103.55, high_total=104.45))
     card = shown(exact)
     assert "104.00 (103.55 to 104.45) kg·m²  ±0.44 %" in card
@@ -74,14 +74,14 @@ def test_the_main_shaft_s_is_the_one_to_quote_too():
     assert re.search(r"J at main shaft +416 \(399 to 433\) kg·m²  ±4.0 %", shown(full(), gear_ratio=2.0))
 
 
-def test_open_sides_are_said():
+def test_open_sides_are_stated():
     card = shown(open_sided())
     assert "0.4 s, open on one side" in card
     assert "0 s, open on both sides" in card
     assert re.search(r"J_r \+ J_L +left open by the data", card)
 
 
-def test_a_refusal_shows_nothing_that_is_not_there():
+def test_a_refusal_shows_no_missing_values():
     card = shown(bare(), simulated=False)
     assert "not_identifiable" in card
     assert "Record for longer." in card
@@ -117,7 +117,7 @@ def test_a_half_width_in_percent_is_never_less_than_the_true_one():
 
 
 def test_a_printed_interval_contains_the_true_one():
-    """No end is rounded inwards: 20 000 intervals of any size, as ends and as ±."""
+    """Ends are never rounded inwards, in 20 000 intervals of any size, as ends and as ±."""
     rng = np.random.default_rng(8)
     for value, below, above in zip(rng.normal(0, 300, 20_000), 10 ** rng.uniform(-4, 3, 20_000),
                                    10 ** rng.uniform(-4, 3, 20_000), strict=True):
@@ -151,7 +151,7 @@ def test_the_friction_on_the_card_includes_the_torque_scale_like_the_inertia():
     assert re.search(r"Coulomb friction T_c +59\.7 \(57\.1 to 62\.3\) N·m", shown(full()))
 
 
-def test_a_lag_at_its_bound_of_zero_is_at_most_so_long():
+def test_a_lag_at_its_bound_of_zero_has_an_upper_limit():
     assert estimate_text({"value": 4.6e-17, "low": 0.0, "high": 0.00197}, "s") == "at most 0.00197 s"
     assert estimate_text({"value": 0.0012, "low": 0.0, "high": 0.002}, "s").startswith("0.0012 (")
     assert estimate_text({"value": 0.0, "low": 0.0, "high": 0.0}, "s").startswith("0 ")

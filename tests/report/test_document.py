@@ -1,6 +1,8 @@
-"""The JSON document: every part is in it, units in the names, and no number that JSON doesn't know."""
+"""JSON document: it contains every part, with units in the names, and only numbers that are valid JSON."""
 
 import json
+import math
+from dataclasses import replace
 
 import pytest
 
@@ -8,8 +10,12 @@ from tdhil.fleet import FleetRow
 from tdhil.fleet.trend import _settings
 from tdhil.report.blocks import _run_rows
 from tdhil.report.calibration_page import calibrated_item
+from tdhil.report.card import COMPLIANT, compliant_rows, estimate_text, quoted
 from tdhil.report.document import result_document
 from tests.report.findings import bare, full, open_sided, recording
+
+NAMES = {key: title for title, key, _ in COMPLIANT}
+UNITS = {key: unit for _, key, unit in COMPLIANT}
 
 
 @pytest.mark.parametrize("make", [full, bare, open_sided])
@@ -19,7 +25,7 @@ def test_it_is_json(make):
 
 
 def test_a_revision_is_written_in_hexadecimal_as_in_the_manual_of_the_drive():
-    """65536 is 10000h: in the report of a run, on the page of a calibration, and in a comparison."""
+    """65536 is 10000h in the report of a run, on the page of a calibration, and in a comparison."""
     drive = {"vendor": 0x2A, "product": 402, "revision": 65536, "serial": 7, "name": "EPOS4"}
     document = result_document(bare(), recording(), {"identity": drive}, "run.mcap")
     assert dict(_run_rows(document, recording()))["identity"] == "vendor 2Ah, product 192h, revision 10000h"
@@ -46,6 +52,18 @@ def test_every_part_is_in_it():
     assert shaft["damping_nm_s_rad"] is None
     assert shaft["covariance"] is None       # of a result without it
     assert [line["hertz"] for line in document["lines"]] == [0.1, 0.2, 0.3, 0.4]
+
+
+def test_all_quantities_that_are_proportional_to_torque_include_its_scale():
+    """J_r + J_L stood without it, below a J that includes it."""
+    found = replace(full(), torque_scale_rel_sd=0.02)
+    document = result_document(found, recording(), {}, "run.mcap")
+    for name in ("load_inertia_kg_m2", "total_inertia_kg_m2", "stiffness_nm_rad"):
+        part = document["compliant"][name]
+        assert part["high_total"] - part["value"] == pytest.approx(
+            math.hypot(part["high"] - part["value"], 1.96 * 0.02 * part["value"]), rel=1e-3)
+        (text,) = (str(value) for title, value in compliant_rows(document) if NAMES[name] in title)
+        assert text == estimate_text(quoted(part), UNITS[name])
 
 
 def test_the_interval_to_quote_goes_before_the_repeatability():
@@ -80,12 +98,12 @@ def test_gains_that_the_drive_reported_are_in_it():
 @pytest.mark.parametrize("stated", [
     None, 3, "none", [], {}, {"gain": 5, "gain_nm_s_rad": 1.0}, {"gain": None, "integral": None, "filter": None},
 ])
-def test_a_log_without_them_says_null(stated):
+def test_a_log_without_them_gives_null(stated):
     document = result_document(full(), recording(), {"speed_loop_present": stated}, "run.mcap")
     assert document["speed_loop_present"] is None
 
 
-def test_a_log_is_not_trusted_about_them():
+def test_their_values_in_a_log_are_checked():
     run = {"speed_loop_present": {
         "gain": {"title": "a\nb\x1b", "where": 7, "raw": "12", "value": float("nan"), "unit": True},
         "gain_nm_s_rad": -3.0, "integral_nm_rad": "4", "filter_s": True}}

@@ -1,4 +1,4 @@
-"""The order in which P and I are typed into a drive: the loop in between keeps a phase margin, by python-control."""
+"""Order of entry of P and I into a drive: the loop in between keeps a phase margin, by python-control."""
 
 import numpy as np
 

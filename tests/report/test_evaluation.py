@@ -1,4 +1,4 @@
-"""The page of an evaluation: measured beside predicted, bit and top drive over time; also of one that was cut short."""
+"""Page of an evaluation: measured and predicted values, bit and top drive over time; complete or aborted."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_page_has_both_columns_and_the_pictures(tmp_path):
     (rows(57.0, ())[:100], "red", "ended at 45 rpm, before"),
     (rows(57.0, ())[:1], "red", "ended at 45 rpm, before"),
 ], ids=["differs", "invalid", "cut short", "one cycle"])
-def test_what_is_no_agreement_is_said_in_the_box(log, colour, words, tmp_path):
+def test_a_disagreement_is_stated_in_the_box(log, colour, words, tmp_path):
     found = document(log, complete=len(log) > 100)
     page = evaluation_report(found, log)
     assert page.answer.colour == colour and words in page.answer.reason
@@ -67,7 +67,7 @@ def test_a_damping_that_is_not_compared_is_not_green():
     assert document(rows(57.0, (60.0, 56.3, 57.2), damping=0.22))["damping_compared"] is True
 
 
-def test_a_phase_that_never_came_has_no_picture():
+def test_a_phase_that_did_not_occur_has_no_picture():
     log = rows(57.0, (57.5,))
     log = log[log[:, COLUMNS.index("phase")] != Phase.RELEASED]
     assert len(evaluation_report(document(log), log).sections[1].blocks) == 2

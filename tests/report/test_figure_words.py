@@ -1,4 +1,4 @@
-"""Every row and column of the cards and pages of tune, severity and evaluate has its meaning, each in one line."""
+"""Meanings of every row and column on the cards and pages of tune, severity and evaluate, in one line each."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tests.soft_torque.test_evaluation import rows
 OWN_NAMES = {"Run", "Trials", "To be typed into the drive, by hand"}
 """Sections whose names are those of the run or of the drive."""
 OF_PAGE = {"from", "profile"}
-"""Rows that a page has and a card has not."""
+"""Rows of a page that a card does not have."""
 
 
 def speeds(rpm):
@@ -53,7 +53,7 @@ def speeds(rpm):
 
 @pytest.fixture(scope="module")
 def tuned():
-    """Document of a tuning with all parts: present gains that fail a margin, a schedule and a map."""
+    """Return the document of a tuning with all parts: present gains that fail a margin, a schedule and a map."""
     present = SpeedController(300.0, 1000.0)
     tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0), present=present, draws=4), None)
     tuning = replace(tuning, tuned=tuple(replace(one, cure=speeds(60.0), start=speeds(62.0), linear_limit=speeds(40.0))
@@ -137,7 +137,7 @@ def test_figures_of_a_tuning(tuned):
 
 
 @pytest.mark.heavy
-def test_a_thin_margin_is_red_with_its_number_and_its_limit(tuned):
+def test_a_small_margin_is_red_with_its_value_and_its_limit(tuned):
     """The present gains keep too little phase: their cell is red, and a red line has the limit."""
     red = "\x1b[1;31m"
     printed = io.StringIO()
@@ -175,7 +175,7 @@ def test_figures_of_a_severity(names):
     check(page, shown_by(print_severity, document), [row[0] for row in in_figures[0]])
 
 
-def test_the_map_in_words_is_that_of_its_cells():
+def test_the_map_in_words_agrees_with_its_cells():
     """A row states the speed from which all cells are stable, and the highest speed with stick-slip."""
     speeds_rpm = (20.0, 40.0, 60.0, 80.0)
     stiff = (("stick-slip", "stable", "at risk", "stable"), ("stick-slip", "stick-slip", "at risk", "at risk"))

@@ -1,4 +1,4 @@
-"""What drives, profiles, logs and file names are called is shown, never obeyed: by terminal, markup or reader."""
+"""Names from drives, profiles, logs and files: they are shown as text, without effect on terminal or markup."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_the_preflight_table_and_the_prompt():
                              torque_nm=1.0, time_s=60.0)
     text = motion_summary(found, limits, ExcitationRequest(), (EVIL,))      # type: ignore[arg-type]
     assert harmless(text)
-    assert "\nDrive: safe" not in text      # no line of its own in what the operator confirms
+    assert "\nDrive: safe" not in text      # no additional line in the operator's prompt
 
 
 def test_errors_of_the_tree():
@@ -115,7 +115,7 @@ def test_the_head_of_a_column(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("grade", ["ok", "bad"])
-def test_a_line_of_the_doctor_s(grade):
+def test_a_line_of_doctor(grade):
     from tdhil.buses import DoctorFinding
 
     assert harmless(DoctorFinding(grade, "drive", EVIL, EVIL).text)

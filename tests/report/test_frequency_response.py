@@ -1,4 +1,4 @@
-"""The frequency response in a report: its figure and its sentences, and the advice where distortion was detected."""
+"""Frequency response in a report: figure, sentences, and advice for detected distortion."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_report_shows_the_response_and_its_sentences():
 
 
 @pytest.mark.parametrize(("distorted", "sets", "advised"), [(True, 1, True), (True, 2, False), (False, 1, False)])
-def test_a_second_set_of_phases_is_advised_where_one_showed_distortion(distorted, sets, advised):
+def test_a_second_set_of_phases_is_advised_for_distortion(distorted, sets, advised):
     _, document = measured(distorted)
     response = document["frequency_response"]
     assert (response["distortion"]["detected"], response["realisations"]) == (distorted, 1)

@@ -1,4 +1,4 @@
-"""Letterhead of a report: only the picture of a PNG is kept, anything else is refused in words; every sheet has it."""
+"""Letterhead of a report: only the picture of a PNG is kept, other files are refused, and every sheet has it."""
 
 import base64
 import re
@@ -70,7 +70,7 @@ def test_only_the_picture_is_kept():
     (SIGNATURE + chunk(b"IDAT", b""), "damaged"),
     (SIGNATURE + b"\xff\xff\xff\xffIHDR", "damaged"),
 ], ids=range(15))
-def test_another_file_is_refused_in_words(data, said):
+def test_another_file_is_refused_with_a_reason(data, said):
     with pytest.raises(UsageError, match=f"(?s){said}"):
         clean_logo(data)
 
@@ -117,7 +117,7 @@ def test_the_page_shows_logo_company_and_order_and_loads_nothing():
     assert page.index("Nordwerk") < page.index("<h1>") < page.index("4711-B")
 
 
-def test_a_report_without_a_letterhead_is_as_before():
+def test_a_report_without_a_letterhead_is_unchanged():
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
     from tdhil.report.html import report_page

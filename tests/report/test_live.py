@@ -1,4 +1,4 @@
-"""The live display: what it shows, and that a terminal that takes nothing never holds the control loop up."""
+"""Live display: its content. A blocked terminal never delays the control loop."""
 
 import io
 import os
@@ -22,7 +22,7 @@ def sample(time_s):
 
 
 class Stuck:
-    """A terminal on which somebody pressed Ctrl-S: every write waits until it is let go."""
+    """Terminal after Ctrl-S: every write blocks until ``go`` is set."""
 
     encoding = "utf-8"
 
@@ -43,7 +43,7 @@ class Stuck:
 
 
 def whole_run(display, cycles=300):
-    """Everything that a run asks of a display, from the control loop."""
+    """Make every call of a run to a display, from the control loop."""
     for name in ("setup", "speed"):
         display.stage_started(name, 10.0)
         for cycle in range(cycles):
@@ -55,7 +55,7 @@ def whole_run(display, cycles=300):
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_a_writer_that_blocks_holds_up_no_cycle(terminal):
+def test_a_blocked_write_delays_no_cycle(terminal):
     stuck = Stuck()
     console = Console(file=stuck, force_terminal=terminal, width=80)
     display = LiveDisplay(console, show_preflight=False)
@@ -67,12 +67,12 @@ def test_a_writer_that_blocks_holds_up_no_cycle(terminal):
 
     threading.Thread(target=control_loop, daemon=True).start()
     assert done.wait(30.0), "the control loop hangs on the terminal"
-    assert stuck.writes <= 2           # one is stuck, nothing else was tried
+    assert stuck.writes <= 2           # one write is blocked, and no other was attempted
     stuck.go.set()
     assert display._painter.flush(30.0)
 
 
-def test_a_pty_that_nobody_reads_holds_up_no_cycle():
+def test_a_pty_without_a_reader_delays_no_cycle():
     leader, follower = pty.openpty()
     done = threading.Event()
     try:
@@ -80,14 +80,14 @@ def test_a_pty_that_nobody_reads_holds_up_no_cycle():
         display = LiveDisplay(Console(file=file, force_terminal=True, width=80), show_preflight=False)
 
         def control_loop():
-            for _ in range(200):        # far more than a pty holds
+            for _ in range(200):        # far more than the buffer of a pty
                 display.say("x" * 1000)
             whole_run(display, cycles=50)
             done.set()
 
         threading.Thread(target=control_loop, daemon=True).start()
         assert done.wait(30.0), "the control loop hangs on the terminal"
-        assert not display._painter.flush(0.2)      # it is full indeed
+        assert not display._painter.flush(0.2)      # it is full
     finally:
         reader = threading.Thread(target=lambda: _drain(leader), daemon=True)
         reader.start()
@@ -103,7 +103,7 @@ def _drain(leader):
         pass
 
 
-def test_leaving_it_waits_for_a_blocked_terminal_but_not_for_ever(monkeypatch):
+def test_the_end_waits_for_a_blocked_terminal_for_a_bounded_time(monkeypatch):
     monkeypatch.setattr("tdhil.report.live._LONGEST_FLUSH_S", 0.05)
     stuck = Stuck()
     done = threading.Event()
@@ -119,8 +119,8 @@ def test_leaving_it_waits_for_a_blocked_terminal_but_not_for_ever(monkeypatch):
     stuck.go.set()
 
 
-def test_a_picture_that_comes_late_does_not_take_the_terminal_back():
-    """What is printed next would stand behind its last line, on the same one: a prompt, or the card."""
+def test_a_late_picture_is_not_drawn_after_the_end():
+    """The next output, such as a prompt or the card, would follow on the same line."""
     import io
 
     shown, go = io.StringIO(), threading.Event()
@@ -128,13 +128,13 @@ def test_a_picture_that_comes_late_does_not_take_the_terminal_back():
     display.stage_started("setup", 10.0)
     display.cycle(COMMAND, sample(0.0))
     assert display._painter.flush(30.0)
-    display._painter.line(lambda: go.wait(30.0))      # a computer with other things to do
+    display._painter.line(lambda: go.wait(30.0))      # a busy computer
     display.stopped(True)
     threading.Timer(0.2, go.set).start()
     display.pause()
     assert display._painter.flush(30.0)
     assert shown.getvalue().count("\x1b[?25l") == 1    # taken once,
-    assert shown.getvalue().endswith("\n\x1b[?25h")    # and left on a new line
+    assert shown.getvalue().endswith("\n\x1b[?25h")    # and ended on a new line
     display._painter.end()
 
 
@@ -178,12 +178,12 @@ def test_on_a_terminal_the_last_picture_is_that_of_the_end():
     shown = io.StringIO()
     with LiveDisplay(Console(file=shown, force_terminal=True, width=100), show_preflight=False) as display:
         whole_run(display, cycles=3)
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())       # what is left once the cursor is back
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())       # the final picture with the visible cursor
     assert text.rstrip().splitlines()[-1].startswith("shaft at standstill")
     assert text.endswith("\n")
 
 
-def test_a_terminal_that_has_gone_is_no_trouble_of_the_run():
+def test_a_lost_terminal_does_not_affect_the_run():
     painter = Painter()
 
     def gone():
@@ -197,7 +197,7 @@ def test_a_terminal_that_has_gone_is_no_trouble_of_the_run():
     assert not seen
 
 
-def test_a_mistake_of_ours_is_raised_in_the_control_loop():
+def test_a_programming_error_is_raised_in_the_control_loop():
     painter = Painter()
     painter.line(lambda: 1 / 0)
     assert painter.flush(30.0)
@@ -207,7 +207,7 @@ def test_a_mistake_of_ours_is_raised_in_the_control_loop():
     assert painter.flush(30.0)
 
 
-def test_of_pictures_the_latest_and_of_lines_so_many():
+def test_the_latest_picture_and_a_limited_number_of_lines_are_kept():
     painter, go, seen = Painter(), threading.Event(), []
     started = threading.Event()
 
@@ -225,7 +225,7 @@ def test_of_pictures_the_latest_and_of_lines_so_many():
     assert seen == [*range(100, MOST_LINES + 100), -(MOST_LINES + 99)]
 
 
-def test_nothing_to_wait_for_before_the_first_job():
+def test_there_is_no_wait_before_the_first_job():
     assert Painter().flush(0.0)
 
 
@@ -233,7 +233,7 @@ def test_nothing_to_wait_for_before_the_first_job():
 
 
 def answers(**more):
-    """Ten intervals that become narrower."""
+    """Return ten intervals that become narrower."""
     return [
         LiveInertia(60.0 + 20.0 * k, 3 + k, 0.95, "valid", "", 104.0, 104.0 - 4.0 / (k + 1), 104.0 + 3.0 / (k + 1),
                     100.0, 108.0, 0.41, **more)

@@ -1,4 +1,4 @@
-"""The report as PDF: A4, nothing outside the margins, no text on another, tables whole, the same twice."""
+"""Report as PDF: A4, all content within the margins, no overlapping texts, whole tables, and reproducible."""
 
 import io
 import itertools
@@ -30,7 +30,7 @@ def report(found, run=RUN, **changes):
 
 
 def wordy():
-    """Much of everything: more than a sheet of table, texts that wrap, one without a space."""
+    """Return a long report: a table of more than a sheet, texts that wrap, one without a space."""
     everything = full()
     return replace(
         everything, warnings=(LONG, "x" * 400, "three"), reason=LONG,
@@ -40,7 +40,7 @@ def wordy():
 
 
 def texts_of(figure):
-    """(text, bounds in points, y up) of what the report itself wrote on a sheet; pictures have their own axes."""
+    """Return (text, bounds in points, y up) of the texts on a sheet, without those in pictures."""
     figure.dpi = 72
     renderer = RendererPdf(PdfFile(io.BytesIO()), 72, HIGH / 72.0, WIDE / 72.0)       # letters as wide as in the file
     found = []
@@ -52,7 +52,7 @@ def texts_of(figure):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("make", [full, bare, open_sided, wordy])
-def test_everything_lies_within_the_margins_and_nothing_on_another(make):
+def test_everything_is_within_the_margins_and_nothing_overlaps(make):
     for figure in sheets_of(report(make(), {**RUN, "note": LONG, "operator": "y" * 300})):
         assert figure.get_size_inches() * 72.0 == pytest.approx((WIDE, HIGH))
         texts = texts_of(figure)
@@ -81,12 +81,12 @@ def test_a_long_table_is_split_with_its_head_and_a_short_one_never():
 
 
 def lowest_of(figure):
-    """The lowest text above the foot of a sheet, points."""
+    """Return the position of the lowest text above the foot of a sheet, points."""
     return min(y0 for _, _, y0, _, _ in texts_of(figure) if y0 > 40.0)
 
 
 def stopped():
-    """A result from the stages before the excitation: no frequencies, and less of everything."""
+    """Return a result of the stages before the excitation: no frequencies, and fewer values."""
     everything = full()
     return replace(everything, lines=(), friction_curve=(), second_opinions=(), compliant=None)
 
@@ -109,7 +109,7 @@ def test_the_last_sheet_of_other_reports_is_half_full(make):
 
 @pytest.mark.heavy
 def test_a_report_of_little_more_than_a_sheet_is_shared_between_two():
-    """The second sheet cannot be half full without an empty part of the first: it is fuller than before."""
+    """The second sheet cannot be half full without a gap on the first one, but it is fuller than before."""
     first, second = sheets_of(report(bare()))
     assert lowest_of(first) < 0.35 * HIGH
     assert lowest_of(second) < 0.7 * HIGH
@@ -118,7 +118,7 @@ def test_a_report_of_little_more_than_a_sheet_is_shared_between_two():
 @pytest.mark.heavy
 @pytest.mark.parametrize("lines", [24, 34, 44])
 def test_a_table_leaves_no_sheet_before_it_mostly_empty(lines):
-    """A table of the excited frequencies that fits a sheet of its own: it is split instead, with its head."""
+    """The table of the excited frequencies would fit on its own sheet, but it is split, with a repeated head."""
     everything = full()
     found = replace(everything, lines=tuple(replace(everything.lines[0], hertz=0.01 * k) for k in range(1, lines + 1)))
     figures = sheets_of(report(found))
@@ -130,7 +130,7 @@ def test_a_table_leaves_no_sheet_before_it_mostly_empty(lines):
 
 
 @pytest.mark.heavy
-def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
+def test_it_is_a_pdf_with_this_number_of_pages_and_reproducible():
     one, other = pdf_bytes(report(full())), pdf_bytes(report(full()))
     assert one == other
     assert one.startswith(b"%PDF-")
@@ -140,7 +140,7 @@ def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
 
 @pytest.mark.heavy
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext (poppler-utils) here")
-def test_its_text_can_be_read_by_others(tmp_path):
+def test_its_text_can_be_read_by_other_programs(tmp_path):
     (tmp_path / "r.pdf").write_bytes(pdf_bytes(report(full())))
     said = subprocess.run(["pdftotext", "-layout", tmp_path / "r.pdf", "-"], capture_output=True, text=True, check=True)
     for wanted in ("J_r = 104.0 (99.9 to 108.1) kg·m² ±4.0 %", "Hall B · 2026-03-04 05:06:07 UTC+01:00", "987654",

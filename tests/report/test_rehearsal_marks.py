@@ -1,4 +1,4 @@
-"""Each report and each text on the terminal marks a rehearsal. Only the result of an identification once did."""
+"""Marks of rehearsals in each report and on the terminal. Only the result of an identification used to have it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_terminal_marks_an_evaluation_and_a_verification():
     assert "· SIMULATED" in printed(print_verification, plain) and "REHEARSAL" not in printed(print_verification, plain)
 
 
-def test_the_report_of_an_evaluation_is_marked_as_that_of_a_result(tmp_path):
+def test_the_report_of_an_evaluation_is_marked_like_that_of_a_result(tmp_path):
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
     log = rows(57.0, (57.5,))

@@ -1,4 +1,4 @@
-"""The rows of a verification by steps: what they state, and that they state nothing of a response without gains."""
+"""Rows of a verification by steps: their statements, and no statement for a response without gains."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.speed_loop.test_verification import CASE, PERIOD_S, PROGRAM, found, r
 
 
 def shown(pairs):
-    """Return the document of these pairs of steps, and what the terminal shows."""
+    """Return the document of these pairs of steps, and the text on the terminal."""
     document = verification_document(found(pairs), CASE, PROGRAM, recording(), RUN, "run.mcap")
     out = io.StringIO()
     print_verification(document, PlainConsole(out))

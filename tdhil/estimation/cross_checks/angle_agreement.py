@@ -7,24 +7,29 @@ by τ at both ends:
 
 A stretch with equal speed at both ends gives the ratio k of true to reported speed without knowledge of τ. For other
 stretches the longest plausible lag bounds the error.
+
+With the true speed k ω_rep, the equation T = J ω' gives J_rep = k J for the reported speed: the true J is J_rep/k if
+the angle is right, and J_rep if it is not. The total interval contains both, unless k is so far from 1 that no J is
+given.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from profiles import MessageCode
+from profiles import CodedText, MessageCode
 from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.momentum import LONGEST_GAP_S
-from tdhil.estimation.result import Refusal
+from tdhil.estimation.result import BudgetLine, Refusal
 from tdhil.estimation.samples import LONGEST_LAG_S, Samples, acquisitions, excited_window, usable_samples
 from tdhil.recording import Recording
 
 _END_S = 0.5              # s; time at either end of a stretch over which its speed is averaged
 _LEAST_S = 2.0            # s; least duration of a stretch
 _LEAST_READINGS = 8       # fewest readings of the angle in a stretch
+NEGLIGIBLE = 0.005        # difference of angle and speed that widens no interval: an eighth of the usual torque scale
 RATIOS_ALIKE = 0.02       # largest relative difference between the ratios of two stages, as both are rounded
 
 
@@ -122,9 +127,10 @@ def angle_ratios(
     return found[0], found[1]
 
 
-def _contradiction(recording: Recording, samples: Samples) -> Refusal | None:
+def _contradiction(
+    recording: Recording, steady: tuple[AngleRatio, ...], excited: tuple[AngleRatio, ...]
+) -> Refusal | None:
     """Return the contradiction between the angle and the speed used for J; None without one, or without an angle."""
-    steady, excited = angle_ratios(recording, samples)
     for one in excited:
         if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:
             return Refusal(
@@ -147,10 +153,27 @@ def _contradiction(recording: Recording, samples: Samples) -> Refusal | None:
 
 
 def angle_checked(finding: Finding, case: Case) -> Finding:
-    """Return the finding, without its inertia if the angle contradicts the speed. Never raises."""
-    if finding.inertia is None or case.recording.position_rad is None:
+    """Return the finding, without its inertia if the angle contradicts the speed. Never raises.
+
+    A smaller difference than the tolerance counts as uncertainty of the speed scale, unless the operator has confirmed
+    the unit of speed.
+    """
+    recording, inertia = case.recording, finding.inertia
+    if inertia is None or recording.position_rad is None:
         return finding
-    contradiction = _contradiction(case.recording, case.samples)
-    if contradiction is None:
+    steady, excited = angle_ratios(recording, case.samples)
+    contradiction = _contradiction(recording, steady, excited)
+    if contradiction is not None:
+        return finding.taken_back(contradiction)
+    off = [one for one in excited if abs(one.value - 1.0) > max(one.half_width, NEGLIGIBLE)]
+    if not off or recording.speed_unit_accepted:
         return finding
-    return finding.taken_back(contradiction)
+    worst = max(off, key=lambda one: abs(1.0 / one.value - 1.0))
+    share = abs(1.0 / worst.value - 1.0)
+    line = BudgetLine("speed scale", share * inertia.value, "angle against reported speed; not in the repeatability")
+    warning = CodedText(
+        f"in {worst.where} the angle of the shaft moved {worst.value:.4g} times as far as the integral of the reported "
+        f"speed (±{worst.half_width:.2g}): the total intervals were widened by {100.0 * share:.2g} %",
+        MessageCode.SPEED_UNLIKE_ANGLE)
+    budget = (*finding.budget[:-1], line, *finding.budget[-1:]) if finding.budget else ()    # torque scale stays last
+    return replace(finding, speed_scale_share=share, budget=budget, warnings=(*finding.warnings, warning))

@@ -589,7 +589,8 @@ def _stands(chosen: Chosen, result: CompliantResult, case: PeriodicCase, rigid: 
         return replace(finding, inertia=result.inertia, budget=result.budget, words=words)
     total = result.shaft.total_inertia
     together = "" if total is None else (
-        f"; together they are {total.value:.4g} kg·m² ({printed_interval(total.low, total.high)})")
+        f"; together they are {total.value:.4g} kg·m² ({printed_interval(total.low, total.high)}) with an exact torque"
+        " scale")
     return replace(finding, refusal=Refusal(
         f"{finding.explained}, but cannot separate the inertia of the motor from that of the load{together}",
         "excite lines on both sides of the resonance, and well above it, where the motor turns alone",
