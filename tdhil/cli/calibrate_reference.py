@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tdhil.cli.replay import read_recorded
 from tdhil.cli.report_file import ReportFile
 from tdhil.cli.results import print_json
-from tdhil.errors import ExitCode, UsageError, existing_file
+from tdhil.errors import ExitCode, MessageCode, UsageError, existing_file
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -68,9 +68,17 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
 
 
 def require_new(path: Path | None) -> None:
-    """Raise UsageError if the file exists already."""
+    """Raise UsageError if the file exists already, or its folder does not."""
     if path is not None and path.exists():
         raise existing_file(f"--save {path}")
+    require_folder(path)
+
+
+def require_folder(path: Path | None) -> None:
+    """Raise UsageError if the folder of a file to be saved does not exist."""
+    if path is not None and not path.absolute().parent.is_dir():
+        raise UsageError("can't be written: its folder does not exist", where=f"--save {path}",
+                         next_step=f"Make {path.parent} first", entry=MessageCode.FILE_NOT_WRITABLE)
 
 
 def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:

@@ -5,6 +5,7 @@ calibration.
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,7 +42,7 @@ def check_calibrate(namespace: argparse.Namespace) -> None:
         raise UsageError("needs the inertia of the body", where="--calibrate", next_step=f"Such as: {_EXAMPLE}")
     for flag, given in (("--dry-run", namespace.dry_run), (OPTION["json"].flag, namespace.json),
                         ("--report", namespace.report is not None), (OPTION["trace"].flag, namespace.trace is not None),
-                        (OPTION["fault"].flag, bool(namespace.fault))):
+                        (OPTION["fault"].flag, bool(namespace.fault)), (OPTION["expect"].flag, bool(namespace.expect))):
         if given:
             raise UsageError("does not go with --calibrate", where=flag, next_step="Run both runs one by one, then:"
                              " tdhil calibrate torque without.mcap with.mcap --added J")
@@ -97,6 +98,7 @@ def run_calibration(namespace: argparse.Namespace, run: Run) -> int:
     step(4, "calibration")
     code = calibrate_two(logs[0], logs[1], namespace.added, namespace.added_sd, saved)
     if code == ExitCode.OK:
-        console.print(f"to use it, write in rig.yaml: drive_data: {{torque_calibration: {saved}}}", markup=False,
-                      soft_wrap=True)
+        named = saved if rig is None else Path(os.path.relpath(saved, rig.folder))     # as rig.yaml names files
+        console.print(f"to use it, write in rig.yaml: drive_data: {{torque_calibration: {named.as_posix()}}}",
+                      markup=False, soft_wrap=True)
     return code

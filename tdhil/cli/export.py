@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.cli.arguments import require_log
+from tdhil.cli.results import whole_or_none
 from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, UsageError, existing_file
 
 if TYPE_CHECKING:
@@ -54,11 +55,12 @@ def run(namespace: argparse.Namespace) -> int:
         _duckdb()
     try:
         found = read_run(path)
-        if namespace.to in _CAN_ONLY:
-            written = _write_frames(namespace.to, path, target, found.epoch_ns)
-        else:
-            write = _write_csv if namespace.to == "csv" else _write_parquet
-            written = write(path, target, int(found.recording.simulated))
+        with whole_or_none(target):
+            if namespace.to in _CAN_ONLY:
+                written = _write_frames(namespace.to, path, target, found.epoch_ns)
+            else:
+                write = _write_csv if namespace.to == "csv" else _write_parquet
+                written = write(path, target, int(found.recording.simulated))
     except LogError as error:
         raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
     except OSError as error:

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="folders with run.mcap files and traces (.csv with a .yaml of the same name), or files")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE",
                         help="the table: fleet.parquet (extra `fleet`), fleet.csv or fleet.sqlite")
-    _add_settings(parser)
+    _add_settings(parser, "print the summary as one JSON document on stdout")
     where = parser.add_mutually_exclusive_group()
     _add_jobs(where)
     where.add_argument("--scheduler", metavar="tcp://HOST:8786", help="use a Dask cluster instead (extra `cluster`)")
@@ -39,18 +39,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
 
 
+LEAST_EVERY_S = 0.1
+"""Least polling interval of `watch`, s."""
+
+
 def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of watch."""
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder that receives logs, with its subfolders")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the table (default: DIR/fleet.csv)")
-    _add_settings(parser)
+    _add_settings(parser, "print one JSON document a line on stdout, for each log")
     _add_jobs(parser)
-    parser.add_argument("--every", type=amount(TIME), default=2.0, metavar="S", help="polling interval (default 2 s)")
+    parser.add_argument("--every", type=amount(TIME), default=2.0, metavar="S",
+                        help=f"polling interval, at least {LEAST_EVERY_S:g} s (default 2 s)")
     parser.add_argument("--once", action="store_true", help="check once, then end")
     parser.set_defaults(run=run_watch)
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
+def _add_settings(parser: argparse.ArgumentParser, json_help: str) -> None:
     add_settings(parser, "each run's")
     parser.add_argument("--time-limit", type=amount(TIME), default=120.0, metavar="S",
                         help="time limit for one log; a log that exceeds it twice is set aside (default 120 s)")
@@ -58,7 +63,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
                         help="memory limit for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
     add_left_out(parser, "left out")
-    add_option(parser, OPTION["json"], help="print the summary as one JSON document on stdout")
+    add_option(parser, OPTION["json"], help=json_help)
 
 
 def _add_jobs(group: Any) -> None:
@@ -83,6 +88,9 @@ def run_watch(namespace: argparse.Namespace) -> int:
     folder: Path = namespace.folder
     if not folder.is_dir():
         raise UsageError("this folder does not exist", where=str(folder), entry=MessageCode.FILE_NOT_FOUND)
+    if not namespace.every >= LEAST_EVERY_S:
+        raise UsageError(f"{namespace.every:g} s is too short an interval", where="--every",
+                         next_step=f"Give {LEAST_EVERY_S:g} s or more", entry=MessageCode.VALUE_NOT_ALLOWED)
     request = _request(namespace, (str(folder),), namespace.out or folder / "fleet.csv")
     watch = FolderWatch(request)
     if not namespace.once and sys.stderr.isatty():
@@ -90,7 +98,7 @@ def run_watch(namespace: argparse.Namespace) -> int:
     while True:
         for row in watch.look(at_once=namespace.once):
             if namespace.json:
-                sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
+                sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False, allow_nan=False) + "\n")
             else:
                 PlainConsole().print(f"{_log_text(row)}: {_result_text(row)}", soft_wrap=True)
             sys.stdout.flush()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from profiles import with_code
 from tdhil.cli.arguments import PICTURES, add_option, add_settings, require_target, settings_in
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
-from tdhil.cli.results import print_json
+from tdhil.cli.results import print_json, whole_or_none
 from tdhil.config import OPTION
 from tdhil.csv_text import cell_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
@@ -88,8 +88,7 @@ def run(namespace: argparse.Namespace) -> int:
         print_responses(responses, PlainConsole())
     if any(one["frequency_response"] is None for one in responses):
         return int(ExitCode.NOT_IDENTIFIABLE)
-    whole = all(one.record.assumed is not None or one.record.whole for one in found)
-    return int(ExitCode.OK if whole else ExitCode.PARTIAL)
+    return int(ExitCode.PARTIAL if any(one.record.partial for one in found) else ExitCode.OK)
 
 
 def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
@@ -140,7 +139,8 @@ def _write_table(found: Sequence[Result], path: Path) -> None:
     if not rows:
         return
     try:
-        (_write_parquet if path.suffix.lower() == ".parquet" else _write_csv)(rows, path)
+        with whole_or_none(path):
+            (_write_parquet if path.suffix.lower() == ".parquet" else _write_csv)(rows, path)
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--out {path}",
                          entry=MessageCode.FILE_NOT_WRITABLE) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from tdhil.buses import PeerPlan, all_buses
 from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_options
 from tdhil.cli.calibrate_run import add_calibrate_arguments, check_calibrate, run_calibration
 from tdhil.cli.report_file import ReportFile, add_report_option
+from tdhil.cli.results import print_json
 from tdhil.config import OPTION, Overrides, RunDetails, Topic, load_rig, resolve
 from tdhil.errors import ExitCode, LogError, TdhilError, code_of, error_document, exit_code
 
@@ -27,11 +29,14 @@ if TYPE_CHECKING:
     from tdhil.speed_loop import StepCase
 
 
-def list_faults(drive: str | None) -> int:
+def list_faults(drive: str | None, *, as_json: bool = False) -> int:
     """Print the known faults of one bus, or of all of them. Return the exit code."""
     from sim_bus import printed_width
 
     shown, width = [bus for bus in all_buses() if drive in (None, bus.name)], printed_width()
+    if as_json:
+        print_json({"kind": "faults", "buses": {bus.name: bus.fault_listing(width).splitlines() for bus in shown}})
+        return 0
     print("\n\n".join(f"--drive {bus.name}\n\n{bus.fault_listing(width)}" for bus in shown))  # noqa: T201
     return 0
 
@@ -101,7 +106,7 @@ def run_with(
     from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
-        return list_faults(vars(namespace).get("drive"))
+        return list_faults(vars(namespace).get("drive"), as_json=namespace.json is True)
     rig = load_rig(namespace.rig) if namespace.rig else None
     options = resolve(vars(namespace), rig)
     if options.json is True:
@@ -113,10 +118,10 @@ def run_with(
     _check_files(namespace, options)
     simulated = options.simulate or not connection.configured
     if namespace.dry_run:
+        bench = suited(rig, plan_peer(options, connection).plant)
         if case is not None:
-            bench = suited(rig, plan_peer(options, connection).plant)
             return dry_run_case(options, bench, case, simulated, options.rate_hz or connection.profile.usual_rate_hz)
-        return dry_run(options, rig, simulated, connection.profile)
+        return dry_run(options, bench, simulated, connection.profile)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     details = RunDetails.of(vars(namespace))
@@ -124,9 +129,11 @@ def run_with(
         options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), stated=details.texts(),
         real_time_priority=bool(details.real_time_priority), case=case, expect=details.expect,
     )
+    if vars(namespace).get("calibrate"):
+        request = replace(request, acceptance=())      # the body changes J, and the torque scale is not yet calibrated
     if case is None:
         with working("planning …", console):
-            said = say_before(options, rig, connection.profile, simulated)
+            said = say_before(options, request.rig, connection.profile, simulated)
         if said is not None:
             console.print(said, style="yellow", markup=False)
     return _run(request, console, report, logs)

@@ -116,7 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 141      # the reader of the output has closed it
         except Exception as error:
             # a syntax error gives no namespace, but a caller with --json still expects a document
-            return _report(error, getattr(namespace, "json", None) is True or "--json" in arguments)
+            as_json = getattr(namespace, "json", None) is True or "--json" in arguments
+            printed = getattr(sys.stdout, "written", False)      # stdout has one document, that of the result
+            return _report(error, as_json and not printed)
     return code
 
 

@@ -133,8 +133,7 @@ def _identify(namespace: argparse.Namespace, recorded: RunRecord, report: Report
         print_result(result.document, namespace.json)
     finally:
         save_report(result.document, recorded.recording, report)
-    part = recorded.assumed is None and not recorded.whole
-    return int(ExitCode.PARTIAL if part and result.exit_code is ExitCode.OK else result.exit_code)
+    return int(ExitCode.PARTIAL if recorded.partial and result.exit_code is ExitCode.OK else result.exit_code)
 
 
 def _log(namespace: argparse.Namespace) -> Path:

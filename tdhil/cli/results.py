@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.standard_streams import OutputLost
@@ -39,6 +41,18 @@ def save_report(
         if written != path:
             print(f"tdhil: {path} was created by another program meanwhile", file=sys.stderr)  # noqa: T201
         print(f"report: {written}", file=sys.stderr)  # noqa: T201
+
+
+@contextmanager
+def whole_or_none(target: Path) -> Iterator[None]:
+    """Remove a new file whose writing ends early: a part of it would pass for the whole."""
+    try:
+        yield
+    except FileExistsError:
+        raise                        # the file of somebody else
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
 
 
 def print_json(document: Mapping[str, Any]) -> None:

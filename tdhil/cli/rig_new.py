@@ -29,10 +29,15 @@ def run(namespace: argparse.Namespace) -> int:
     """Write the file, and report the entries to fill in. Raises UsageError if it cannot be written."""
     from profiles import load_profile
     from tdhil.cli.scan import write_new
+    from tdhil.config import LONGEST_NAME
+    from tdhil.errors import MessageCode, UsageError
     from tdhil.session import RigEntries, blank_rig, to_fill_in
 
     path: Path = namespace.file
     name = namespace.name or _asked()
+    if name is not None and len(name) > LONGEST_NAME:
+        raise UsageError(f"{len(name)} characters are too many", where="--name",
+                         next_step=f"Give at most {LONGEST_NAME}", entry=MessageCode.VALUE_NOT_ALLOWED)
     profile = load_profile(namespace.profile)
     named = namespace.profile
     if named.endswith((".yaml", ".yml")):

@@ -37,8 +37,10 @@ class WatchedStream:
         self._stream = stream
         self._needed = needed
         self._lost = False
+        self.written = False
 
     def write(self, text: str) -> int:
+        self.written = True
         if not self._lost:
             self._try(lambda: self._stream.write(_in_columns(text, self._stream.encoding)))
         return len(text)

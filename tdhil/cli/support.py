@@ -17,6 +17,7 @@ from typing import Any
 
 from tdhil.buses import all_buses
 from tdhil.cli.arguments import require_log
+from tdhil.cli.results import whole_or_none
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError, existing_file
 from tdhil.evidence import Scrub
 from tdhil.version import __version__
@@ -51,7 +52,8 @@ def run(namespace: argparse.Namespace) -> int:
     scrub = Scrub.of_this_computer()
     whole = True
     try:
-        with target.open("xb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        with (whole_or_none(target), target.open("xb") as file,
+              zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive):
             for name, text in about(log):
                 archive.writestr(name, scrub.text(text))
             if namespace.rig is not None:

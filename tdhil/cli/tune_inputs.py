@@ -46,7 +46,7 @@ def read_result(path: Path) -> Mapping[str, Any]:
         return identify(read(path), confidence=COVERAGE).document
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"is neither a log nor JSON ({str(error)[:80]})", where=str(path),
                          next_step="Name a result.json of tdhil identify --json, or a run.mcap",
                          entry=MessageCode.WRONG_KIND_OF_FILE) from None

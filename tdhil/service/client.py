@@ -9,6 +9,7 @@ import urllib.error
 import urllib.request
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
+from http.client import HTTPException
 from pathlib import Path
 from typing import IO, Any, Final
 from urllib.parse import quote, urlencode
@@ -267,14 +268,22 @@ class Client:
 
     def download(self, run: str, name: str, path: str | Path) -> Path:
         """Save ``log.mcap``, ``report.html``, ``report.pdf``, ``result.json`` or ``trace.csv`` of a run as a new
-        file. Raises UsageError if it exists.
+        file. Raises UsageError if it exists, and CommunicationLost, without a file, if the connection ends early.
         """
         if (target := Path(path)).exists():
             raise existing_file(target)
         with self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer, \
                 target.open("xb") as file:
-            while piece := answer.read(2**16):
-                file.write(piece)
+            announced, received, why = answer.headers.get("Content-Length"), 0, "the connection ended early"
+            try:
+                while piece := answer.read(2**16):
+                    received += file.write(piece)
+            except (OSError, HTTPException) as error:
+                announced, why = "", str(error) or type(error).__name__
+            if announced is not None and announced != str(received):
+                target.unlink()
+                raise CommunicationLost(f"only a part of {name} arrived ({received} bytes): {why}", where=run,
+                                        next_step="Download it again", entry=MessageCode.SERVER_UNREACHABLE)
         return target
 
     def audit(self, limit: int = 200, *, head: str | None = None) -> dict[str, Any]:

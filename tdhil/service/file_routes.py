@@ -17,7 +17,7 @@ from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import apis
 from tdhil.service.run_state import NotThere
 from tdhil.service.schemas import PictureView
-from tdhil.service.store import LOG
+from tdhil.service.store import LOG, RECOVERED
 from tdhil.service.uploads import TRACE
 
 if TYPE_CHECKING:
@@ -82,6 +82,11 @@ async def samples(site: Site, request: Request, body: None) -> Response:
                              entry=MessageCode.NOT_READY)
         await site.work("samples", run, {})
     return await file_of(site, request, "samples.csv", "text/csv")
+
+
+async def recovered(site: Site, request: Request, body: None) -> Response:
+    """Return the undamaged copy of a log that broke off."""
+    return await file_of(site, request, RECOVERED, "application/octet-stream")
 
 
 async def recording(site: Site, request: Request, body: None) -> Response:

@@ -129,6 +129,7 @@ class RunProcess:
                                    entry=MessageCode.CHANGED_MEANWHILE)
 
     def _run(self) -> int:
+        from tdhil.errors import LogError, exit_code
         from tdhil.report import has_extra
         from tdhil.session import RunSession, kept_connection
 
@@ -166,15 +167,20 @@ class RunProcess:
         except BaseException:
             session.abandon()
             raise
-        session.close()
         write_json(self.folder / "result.json", found.document)
+        code, lost = int(found.exit_code), None
+        try:
+            session.close()
+        except LogError as error:              # standstill is confirmed, and J does not need the rest of the log
+            print_line(f"the log is not complete: {error}")
+            code, lost = code or int(exit_code(error)), Told.of(error)
         recording = session.log.recording(complete=True)
         self._row(found.document, recording.torque_scale_rel_sd)
         if report:
             self._report(found.document, recording)
-        self._end(State.DONE, int(found.exit_code), verdict=found.document["verdict"],
-                  rehearsal=found.document["rehearsal"])
-        return int(found.exit_code)
+        self._end(State.DONE, code, verdict=found.document["verdict"], rehearsal=found.document["rehearsal"],
+                  error=lost)
+        return code
 
     def _row(self, document: Mapping[str, Any], torque_scale_rel_sd: float) -> None:
         """Write the run as a row of its rig's history."""

@@ -767,6 +767,8 @@ ROUTES: Final = (
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
     Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
           _file("application/octet-stream"), errors=(404,), headers=_RANGE),
+    Route("GET", "/runs/{run}/recovered.mcap", "recovered", "An undamaged copy of a log that broke off", "viewer",
+          _file("application/octet-stream"), errors=(404,), headers=_RANGE),
     Route("GET", "/runs/{run}/report.html", "report", "The report", "viewer", _file("text/html"), errors=(404,),
           headers=_RANGE),
     Route("GET", "/runs/{run}/report.pdf", "report_pdf", "The report on A4, made at the first request", "viewer",

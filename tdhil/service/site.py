@@ -35,7 +35,7 @@ from tdhil.service.run_filter import NEWEST, Order, RunFilter, Summary
 from tdhil.service.run_state import NotThere, State, Status
 from tdhil.service.schemas import ReplayView, RigView, RunsPageView, RunView, adapter
 from tdhil.service.start_request import RigFile
-from tdhil.service.store import CHOSEN, LOG, read_as, read_json
+from tdhil.service.store import CHOSEN, LOG, RECOVERED, read_as, read_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.uploads import TRACE, Uploads
 from tdhil.session import Holder
@@ -309,7 +309,7 @@ class Site:
         with suppress(TdhilError):
             rig_name = self.supervisor.rig(request.rig).name
         annotations = self.store.annotations(run)
-        found = [name for name in (LOG, TRACE, "recovered.mcap", "report.html", "result.json", "report.pdf",
+        found = [name for name in (LOG, TRACE, RECOVERED, "report.html", "result.json", "report.pdf",
                               ARCHIVE)
                  if (folder / name).is_file()]
         return RunView(

@@ -432,11 +432,12 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
 
 def plan_of(rig: RigFile, asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the plan, its assumptions and its expected result. No drive is connected. Raises as `run_request`."""
-    from tdhil.session import plan_document, plan_dry
+    from tdhil.session import plan_document, plan_dry, plan_peer, suited
 
     options, connection = rig.way(asked)
     simulated = options.simulate or not connection.configured
-    planned, figures, limits = plan_dry(options, rig.rig, simulated, connection.profile)
+    bench = suited(rig.rig, plan_peer(options, connection).plant)
+    planned, figures, limits = plan_dry(options, bench, simulated, connection.profile)
     return plan_document(planned, figures, limits)
 
 

@@ -38,6 +38,7 @@ _FILE_LIMIT: Final = 16 * 2**20
 RESERVE: Final = 2**16
 """Disk space reserved for the final status of a run, bytes. It is used when the disk is full."""
 LOG: Final = "run.mcap"
+RECOVERED: Final = "recovered.mcap"
 CONNECTION_FILE: Final = "connection.json"
 """File in a run's folder with the address of its drive, for a later stop (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"

@@ -196,8 +196,7 @@ def identify_upload(kind: str, options: Mapping[str, Any], source: Mapping[str, 
 
         with suppress(UsageError, LogError, OSError):      # the result is valid without its report
             write_report(document, record.recording, Path("report.html"), stored_letterhead(Path("../..")))
-    part = record.assumed is None and not record.whole
-    code = ExitCode.PARTIAL if part and found.exit_code is ExitCode.OK else found.exit_code
+    code = ExitCode.PARTIAL if record.partial and found.exit_code is ExitCode.OK else found.exit_code
     return {
         "verdict": document["verdict"], "exit_code": int(code), "simulated": record.recording.simulated,
         "rehearsal": document["rehearsal"], "identity": (document["drive"] or {}).get("name") or "",

@@ -19,7 +19,7 @@ from typing import Any, Final
 from tdhil.errors import UsageError
 from tdhil.numerics import prepare
 from tdhil.service.run_state import Told, disk_full
-from tdhil.service.store import LOG, Store, read_as
+from tdhil.service.store import LOG, RECOVERED, Store, read_as
 
 NICE: Final = {"plan": 5, "trend": 5, "report": 5, "preview": 5, "upload": 10, "scan": 0, "check": 0, "pace": 0}
 """Nice values of the tasks for which a page waits. A run by the clock has 0."""
@@ -115,8 +115,8 @@ def recover(asked: dict[str, Any]) -> dict[str, Any]:
 
     os.chdir(asked["folder"])
     with suppress(LogError, OSError, UsageError):
-        if not Path("recovered.mcap").exists():
-            write_copy(Path(LOG), Path("recovered.mcap"), examine(Path(LOG)))
+        if not Path(RECOVERED).exists():
+            write_copy(Path(LOG), Path(RECOVERED), examine(Path(LOG)))
     with suppress(LogError, UsageError, ValueError):
         return replay({"folder": asked["folder"]})
     return {"document": None}

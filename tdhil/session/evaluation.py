@@ -28,7 +28,7 @@ def load_document(path: Path, wanted: str, keys: frozenset[str], next_step: str)
                          entry=MessageCode.FILE_NOT_FOUND)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         why = "" if isinstance(error, UnicodeDecodeError) else f" ({str(error)[:80]})"
         raise UsageError(f"is not JSON{why}", where=str(path), next_step=next_step,
                          entry=MessageCode.NOT_A_TUNING) from None

@@ -53,6 +53,11 @@ class RunRecord:
 
         return self.recording.complete and aborted_stage(self.recording) is None
 
+    @property
+    def partial(self) -> bool:
+        """Return whether this is a log without its end, of a run or of a trace. A trace in CSV has no end."""
+        return not self.whole and (self.assumed is None or "trace" in self.configuration)
+
     def asked(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         """Return the configuration, with other settings of identification."""
         own = {**self.configuration.get("identify", {}), **asked}

@@ -29,7 +29,7 @@ RAMP_S = 40.0
 
 def suited(rig: Rig | None, plant: Any) -> Rig | None:
     """Return ``rig``. If ``plant`` (`sim_bus.params.RigParams`) has a string and ``rig`` no limits, it gets limits for
-    it.
+    it. What the file states stays.
     """
     if plant is None or (rig is not None and rig.limits is not None):
         return rig
@@ -39,16 +39,19 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
         return rig
     most_nm = plant.drive.torque_limit_nm
     data = simulated_default_rig(rig).model_dump(by_alias=True)
+    make_up_nm = (None if rig is None else rig.make_up_torque_nm) or most_nm
+    ramp_nm_s = None if rig is None else rig.torque_ramp_nm_s
+    torque_nm = TORQUE_SHARE * min(most_nm, make_up_nm)
     data["limits"] |= {
-        "torque_nm": TORQUE_SHARE * most_nm,
-        "probe_torque_nm": PROBE_SHARE * most_nm,
+        "torque_nm": torque_nm,
+        "probe_torque_nm": min(PROBE_SHARE * most_nm, torque_nm),
         "time_s": TIME_S,
         "quick_stop_rad_s2": QUICK_STOP_RAD_S2,
     }
     data |= {
         "load": data["load"] | {"kind": "string"},
-        "make_up_torque_nm": most_nm,
-        "torque_ramp_nm_s": TORQUE_SHARE * most_nm / RAMP_S,
+        "make_up_torque_nm": make_up_nm,
+        "torque_ramp_nm_s": ramp_nm_s or TORQUE_SHARE * most_nm / RAMP_S,
     }
     bench = rig_model().model_validate(data)
     if rig is not None:

@@ -1,4 +1,4 @@
-"""Recordings of one rig with several bodies on it, in closed form, as records with a log of their own."""
+"""Closed-form recordings of one rig with several bodies, as records with their own logs."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def run(folder: Path, name: str, body: float, found: Recording, sd: float | None
 
 def two(folder: Path, body: float = 55.0, said: float | None = None, with_body: Recording | None = None,
         ) -> list[CalibrationRun]:
-    """Without a body and with one; ``said``: its inertia as it is given."""
+    """Return records without and with a body; ``said``: its stated inertia."""
     loaded = recording(body, 2) if with_body is None else with_body
     return [run(folder, "without.mcap", 0.0, recording(0.0, 1)),
             run(folder, "with.mcap", body if said is None else said, loaded)]

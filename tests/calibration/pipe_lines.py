@@ -1,7 +1,7 @@
-"""Spectral lines above a drill string whose true sizes are drawn from the tolerances of string.yaml.
+"""Spectral lines above a drill string whose true dimensions are drawn from the tolerances of string.yaml.
 
-The string's impedance is the telegraph equation's, by its waves (`tests.estimation.compliant_bench`); nothing of the
-estimation is used.
+The impedance of the string is that of the telegraph equation (`tests.estimation.compliant_bench`). The module uses no
+code of the estimation.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def string_file(tolerance):
 
 
 def true_pipe(rng, tolerance):
-    """(inertia, stiffness) of a pipe drawn within the tolerances; without them worn by up to 15 %, G 61 to 80 GPa."""
+    """Return (inertia, stiffness) of a pipe within the tolerances; without them worn by up to 15 %, G 61 to 80 GPa."""
     def factor(name, default=0.0):
         half = tolerance.get(name, default)
         return rng.uniform(1.0 - half, 1.0 + half)
@@ -40,7 +40,7 @@ def true_pipe(rng, tolerance):
 
 
 def study_case(seed, tolerance=None):
-    """(relative error of κ, the fit, does it cover?) of one string, or why there is none."""
+    """Return (relative error of κ, fit, whether it covers) of one string, or the reason of a refusal."""
     tolerance = MEASURED if tolerance is None else tolerance
     rng = np.random.default_rng([2803, seed])
     inertia, stiffness = true_pipe(rng, tolerance)

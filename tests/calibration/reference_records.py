@@ -1,6 +1,6 @@
-"""Synthetic records of a drive's torque and of a reference sensor, each with a filter, a rate and a time of its own.
+"""Synthetic records of drive torque and a reference sensor, each with its own filter, rate and time.
 
-The filters are solved sample by sample on a fine grid; nothing of the estimation is used.
+The filters are solved sample by sample on a fine grid, without code of the estimation.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ FINE_S = 0.002
 
 @dataclass(frozen=True)
 class SensorBench:
-    """One case. ``factor``: true over reported torque; ``time_offset_s``: of the sensor's time against the log's."""
+    """One case. ``factor``: true over reported torque. ``time_offset_s``: sensor time relative to the log."""
 
     factor: float = 0.95
     offset_nm: float = 1.5
@@ -29,11 +29,11 @@ class SensorBench:
     swing_nm: float = 100.0
     duration_s: float = 240.0
     slow_noise_nm: float = 0.0
-    """Of the sensor, correlated over 3 s."""
+    """Noise of the sensor, correlated over 3 s."""
 
 
 def random_bench(rng):
-    """A bench of the study: scale, offset, noise, delay, rate and low-pass filter of the sensor are random."""
+    """Return a bench of the study with random scale, offset, noise, delay, rate and low-pass filter of the sensor."""
     return SensorBench(
         factor=rng.uniform(0.92, 1.08), offset_nm=rng.uniform(-5.0, 5.0), time_offset_s=rng.uniform(-500.0, 500.0),
         report_lag_s=rng.uniform(0.0, 0.3), sensor_lag_s=rng.uniform(0.0, 0.5),
@@ -44,7 +44,7 @@ def random_bench(rng):
 
 
 def true_torque(rng, time_s, swing_nm):
-    """Ramps between steady torques, a multisine in the second half, and some random torque of the rig."""
+    """Return ramps between steady torques, a multisine in the second half, and a random torque of the rig."""
     end = time_s[-1]
     ramps = np.interp(time_s, end * np.array([0.0, 0.05, 0.1, 0.25, 0.3, 0.45, 0.5, 0.96, 1.0]),
                       swing_nm * np.array([0.0, 0.0, 0.9, 0.9, 0.55, 0.55, 0.7, 0.7, 0.0]))
@@ -56,13 +56,13 @@ def true_torque(rng, time_s, swing_nm):
 
 
 def lagging(signal, lag_s):
-    """Behind a first-order low-pass filter."""
+    """Apply a first-order low-pass filter."""
     pole = np.exp(-FINE_S / lag_s) if lag_s > 0.0 else 0.0
     return lfilter([1.0 - pole], [1.0, -pole], signal)
 
 
 def records(bench, rng):
-    """(drive's record, sensor's record)."""
+    """Return (record of the drive, record of the sensor)."""
     fine = np.arange(0.0, bench.duration_s, FINE_S)
     torque = true_torque(rng, fine, bench.swing_nm)
     report_s = np.arange(0.5, bench.duration_s - 0.5, 1.0 / bench.report_rate_hz)

@@ -1,4 +1,4 @@
-"""Torque calibration by bodies of known inertia: the factor, the budget, and every trap."""
+"""Torque calibration by bodies of known inertia: the factor, the budget, and every possible error."""
 
 import re
 from dataclasses import replace
@@ -127,7 +127,7 @@ def test_a_run_that_was_aborted(tmp_path):
 @pytest.mark.heavy
 @pytest.mark.parametrize("slip_nm_s_rad", [60.0, 300.0])
 def test_a_body_that_slips_on_the_shaft(tmp_path, slip_nm_s_rad):
-    """Coupled by viscous friction alone: at low frequencies it turns as one, at high ones it stays behind."""
+    """The coupling is viscous friction only. At low frequencies the body follows the shaft, at high ones not."""
     s = 2j * np.pi * np.array([0.1, 0.2, 0.3, 0.4])
     body = 55.0 * s * slip_nm_s_rad / (55.0 * s + slip_nm_s_rad)
     plain = recording(0.0, 2)
@@ -143,14 +143,14 @@ def test_a_body_that_slips_on_the_shaft(tmp_path, slip_nm_s_rad):
 
 
 @pytest.mark.heavy
-def test_a_body_that_is_too_small_is_told_the_least_that_would_do(tmp_path):
+def test_a_body_that_is_too_small_is_refused_with_the_required_inertia(tmp_path):
     small = two(tmp_path, 3.0, with_body=recording(3.0, 2, noise=20.0))
     small[0] = run(tmp_path, "noisy.mcap", 0.0, recording(0.0, 1, noise=20.0))
     found = find_calibration(small, "motor").calibration
     assert found.verdict is Verdict.NOT_IDENTIFIABLE and "too small" in found.reason
     least = found.least_added_kg_m2
     (advised,) = re.findall(r"a body of ([\d.]+) kg·m² or more", found.advice)
-    assert 3.0 < least < 200.0 and least <= float(advised) < 1.01 * least        # never less, by its rounding
+    assert 3.0 < least < 200.0 and least <= float(advised) < 1.01 * least        # never rounded down
 
 
 def test_the_same_log_twice(tmp_path):
@@ -160,7 +160,7 @@ def test_the_same_log_twice(tmp_path):
 
 
 @pytest.mark.heavy
-def test_an_uncertainty_that_is_not_stated_is_assumed_and_said(tmp_path):
+def test_an_uncertainty_that_is_not_stated_is_assumed_and_reported(tmp_path):
     runs = two(tmp_path)
     runs[1] = replace(runs[1], added_sd_kg_m2=None)
     found = find_calibration(runs, "motor")
@@ -168,7 +168,7 @@ def test_an_uncertainty_that_is_not_stated_is_assumed_and_said(tmp_path):
     assert any(line.source.startswith("body") for line in found.calibration.budget)
 
 
-def test_the_plan_says_which_body_and_how_long(tmp_path):
+def test_the_plan_states_body_and_duration(tmp_path):
     without, _ = two(tmp_path)
     inertia, minutes, plans = find_plan(without.record, 0.01)
     assert inertia == pytest.approx(SCALE * INERTIA, rel=0.02) and minutes == pytest.approx(140.0 / 60.0)
@@ -180,7 +180,7 @@ def test_the_plan_says_which_body_and_how_long(tmp_path):
 
 
 @pytest.mark.heavy
-def test_intervals_cover_as_often_as_they_say():
+def test_intervals_cover_as_often_as_stated():
     rng, covered, many = np.random.default_rng(4), np.zeros(2, dtype=int), 2000
     for _ in range(many):
         true = np.array([104.0, 156.0]) / 0.96
@@ -193,8 +193,8 @@ def test_intervals_cover_as_often_as_they_say():
 
 
 @pytest.mark.parametrize("runs", [1, 3, 9])
-def test_a_body_is_not_better_known_if_it_is_mounted_more_often(runs):
-    """All runs with it share its error: 1 % of the body is 1 % of κ."""
+def test_repeated_mounting_does_not_reduce_the_uncertainty_of_a_body(runs):
+    """All runs with the body share its error: 1 % of the body gives 1 % of κ."""
     bodies = [0.0] * runs + [55.0] * runs
     values = [104.0 + body for body in bodies]
     found = calibrate_torque(case(values, bodies, noise=1e-4, sds=[0.0] * runs + [0.55] * runs))
@@ -205,8 +205,8 @@ def test_a_body_is_not_better_known_if_it_is_mounted_more_often(runs):
     assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
 
 
-def test_what_all_runs_read_alike_is_in_the_factor_and_cancels_in_j():
-    """Torque that is read in step with a speed setpoint: J of each run has the same relative error."""
+def test_a_common_relative_error_is_in_the_factor_and_cancels_in_j():
+    """With torque read in step with a speed setpoint, J of each run has the same relative error."""
     plain = calibrate_torque(case([104.0, 159.0], [0.0, 55.0]))
     found = calibrate_torque(case([104.0, 159.0], [0.0, 55.0], reading_rel_sd=0.02))
     assert found.inertia_kg_m2 == plain.inertia_kg_m2
@@ -217,7 +217,7 @@ def test_what_all_runs_read_alike_is_in_the_factor_and_cancels_in_j():
 
 
 @pytest.mark.heavy
-def test_runs_in_step_with_a_setpoint_have_its_reading_in_the_factor(tmp_path):
+def test_runs_in_step_with_a_setpoint_have_this_error_in_the_factor(tmp_path):
     stepped = SteppedSetpoint(1.0 / 15.0, 0.9, 1.0, 0.35)
     runs = [replace(one, record=replace(one.record, recording=replace(one.record.recording, stepped_setpoint=stepped)))
             for one in two(tmp_path)]
@@ -230,7 +230,7 @@ def test_runs_in_step_with_a_setpoint_have_its_reading_in_the_factor(tmp_path):
 @pytest.mark.parametrize("other", [
     {"model": "rigid+lags, bent friction"}, {"harmonics": ("one",)}, {"backlash": ("one",)},
 ])
-def test_runs_with_more_than_a_rigid_shaft_and_straight_friction_are_not_fitted_together(other, monkeypatch):
+def test_runs_of_compliant_shafts_or_nonlinear_friction_are_not_fitted_together(other, monkeypatch):
     from tdhil.session import torque_calibration
 
     plain = SimpleNamespace(model="rigid+lags", harmonics=(), backlash=(),

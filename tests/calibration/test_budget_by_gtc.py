@@ -1,4 +1,4 @@
-"""The uncertainty budget, worked out again by GTC, the GUM Tree Calculator of the New Zealand metrology institute."""
+"""Uncertainty budget, compared with GTC, the GUM Tree Calculator of the New Zealand metrology institute."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""``tdhil identify --calibrate``: two runs with a question between them, then the calibration."""
+"""``tdhil identify --calibrate``: two runs with a prompt between them, then the calibration."""
 
 import argparse
 import io
@@ -19,6 +19,12 @@ REAL = ["identify", "--interface", "virtual", "--channel", "none"]
 CALIBRATE = ["--calibrate", "--added", "55"]
 
 
+def test_an_expectation_does_not_go_with_a_calibration(capsys):
+    """The body changes J: the first run ended with "cannot tell", and the calibration with it."""
+    assert main(["identify", "--simulate", *CALIBRATE, "--expect", "inertia=105±5%"]) == 2
+    assert "--expect" in capsys.readouterr().err
+
+
 class Terminal(io.StringIO):
     def isatty(self):
         return True
@@ -30,14 +36,14 @@ def parsed(arguments):
 
 @pytest.fixture
 def calibrated(monkeypatch):
-    """The logs that were calibrated; no log is read."""
+    """Return the calibrated logs; no log is read."""
     calls = []
     monkeypatch.setattr(calibrate, "calibrate_two", lambda *asked: calls.append(asked) or 0)
     return calls
 
 
 def runs(folder: Path, codes=(0, 0)):
-    """Return a run that writes nothing, and the requests that it had."""
+    """Return a run that writes nothing, and its requests."""
     asked: list[argparse.Namespace] = []
 
     def run(namespace, logs):
@@ -53,13 +59,13 @@ def runs(folder: Path, codes=(0, 0)):
     [*CALIBRATE, "--added-sd", "-1"], [*CALIBRATE, "--dry-run"], [*CALIBRATE, "--json"],
     [*CALIBRATE, "--report", "r.html"], [*CALIBRATE, "--trace", "shaft.csv"],
 ])
-def test_what_is_no_request_ends_with_2_before_anything_moves(tmp_path, monkeypatch, more):
+def test_an_invalid_request_ends_with_2_before_motion(tmp_path, monkeypatch, more):
     monkeypatch.chdir(tmp_path)
     assert main(["identify", "--simulate", *more]) == 2
     assert not list(tmp_path.iterdir())
 
 
-def test_the_simulated_shaft_gets_the_body_for_the_second_run(tmp_path, calibrated):
+def test_the_simulated_shaft_has_the_body_in_the_second_run(tmp_path, calibrated):
     run, asked = runs(tmp_path)
     log = tmp_path / "bench.mcap"
     namespace = parsed(["identify", "--simulate", "--seed", "4", "--simulated-added-inertia", "5", "--log", str(log),
@@ -108,19 +114,19 @@ def test_without_a_terminal_nothing_moves(tmp_path, monkeypatch, calibrated):
     assert asked == []
 
 
-def test_the_question_names_what_to_do_later(monkeypatch):
+def test_the_prompt_names_the_command_for_later(monkeypatch):
     monkeypatch.setattr(sys, "stdin", Terminal("no\n"))
     said, before_question = io.StringIO(), []
     monkeypatch.setattr("tdhil.session.confirm._forget_what_was_typed", lambda: before_question.append(said.getvalue()))
     with pytest.raises(PreflightRefused) as refused:
         confirm_mounted(Console(file=said), "tdhil calibrate torque a.mcap with.mcap --added 55")
     assert "lock it out" in said.getvalue() and "a.mcap with.mcap" in str(refused.value)
-    assert before_question == [""]                    # what was typed before it is no answer
+    assert before_question == [""]                    # input before the prompt is no answer
 
 
 @pytest.mark.parametrize("more", [[], CALIBRATE])
 def test_signals_work_after_a_run_of_a_calibration(tmp_path, monkeypatch, more):
-    """After the only run of a process they are ignored; before the prompt and the second run they must not be."""
+    """After the only run of a process, signals are ignored. Before the prompt and the second run they must work."""
     ends = []
 
     class Seen(Exception):

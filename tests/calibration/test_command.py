@@ -29,7 +29,7 @@ def test_logs_without_a_result_end_with_9(traces, capsys):
     assert "can't be used" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_log_that_is_not_there_or_the_same_twice_ends_with_2(traces, tmp_path):
+def test_a_missing_log_or_the_same_twice_ends_with_2(traces, tmp_path):
     assert main(["calibrate", "torque", traces[0], str(tmp_path / "no.mcap"), "--added", "55"]) == 2
     assert main(["calibrate", "torque", traces[0], traces[0], "--added", "55"]) == 2
     assert main(["calibrate", "torque", traces[0], "--added", "55"]) == 2
@@ -37,7 +37,7 @@ def test_a_log_that_is_not_there_or_the_same_twice_ends_with_2(traces, tmp_path)
 
 
 @pytest.mark.parametrize("option", ["--pairs", "--reference", "--known-pipe"])
-def test_a_plan_is_for_a_body_and_says_so(traces, capsys, option):
+def test_a_plan_is_for_a_body_and_states_it(traces, capsys, option):
     assert main(["calibrate", "torque", traces[0], "--plan", option, "file"]) == 2
     assert option in capsys.readouterr().err
 

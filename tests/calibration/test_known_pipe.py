@@ -1,4 +1,4 @@
-"""A drill string of known sizes: sensitivities, exponent, coverage, and what is said of a pipe known badly."""
+"""Drill string with known dimensions: sensitivities, exponent, coverage, and refusal of uncertain pipe data."""
 
 from dataclasses import replace
 
@@ -34,8 +34,8 @@ def test_the_sensitivities_are_those_of_the_formulas():
         assert found[name] == pytest.approx(pair, abs=1e-5), name
 
 
-def test_the_measured_travel_time_replaces_a_shear_modulus_that_is_known_badly():
-    """e = −1 is the string's inertia ρ I L, which has no G in it; e = 0 is its impedance."""
+def test_the_measured_travel_time_replaces_an_uncertain_shear_modulus():
+    """e = −1 is the inertia ρ I L of the string, which does not contain G. e = 0 is its impedance."""
     assert known_pipe_of(string_file(MEASURED), 1.0).exponent == pytest.approx(-1.0, abs=0.05)
     sharp = string_file({**MEASURED, "shear_modulus": 0.001, "length": 0.1})
     assert known_pipe_of(sharp, 1.0).exponent == pytest.approx(0.0, abs=0.05)
@@ -76,7 +76,7 @@ def known(half):
     return KnownPipe(290.0, 0.72, (PipeInput("density of the pipe", 1.0 - half, 1.0 + half, 0.5, 0.5),))
 
 
-def test_a_pipe_that_is_known_worse_than_the_scale_is_refused_with_its_worst_line():
+def test_a_pipe_more_uncertain_than_the_scale_is_refused_with_its_worst_line():
     usual = known_pipe_of(string_file({}), 1.0)
     fit = calibrate_known_pipe(usual, measured(usual.value))
     assert "wider than the torque scale as stated so far (±3.9 %)" in fit.refusal
@@ -101,7 +101,7 @@ def test_a_string_of_several_sections_or_without_a_length_is_no_known_pipe(secti
 
 @pytest.mark.heavy
 def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
-    """A string in the time domain (`tests.estimation.compliant_bench`), its torque reported 4 % too large."""
+    """The string is that of `tests.estimation.compliant_bench` in time, with torque reports 4 % too large."""
     recorded = run(Pipe(), [3], noise=Noise(5.0, 0.005, 2.0, 0.001, 1.0))[0]
     reported = replace(recorded, torque_nm=1.04 * recorded.torque_nm, torque_scale_rel_sd=0.02)
     record = body_run(tmp_path, "run.mcap", 0.0, reported).record
@@ -121,7 +121,7 @@ def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
     aborted = replace(reported, stages=(Stage("acquire", 0.0, end_s, "aborted", "Interrupted: by Ctrl-C"),))
     parts = [find_by_known_pipe(replace(record, recording=replace(aborted, torque_nm=np.where(
         reported.time_s < end_s - 1.0, reported.torque_nm, share * reported.torque_nm))), tmp_path / "measured.yaml",
-        0.95)["calibration_factor"] for share in (1.0, 0.0)]      # whatever follows the abort
+        0.95)["calibration_factor"] for share in (1.0, 0.0)]      # data after the abort
     assert parts[0] == parts[1] and parts[0]["low"] <= 1.0 / 1.04 <= parts[0]["high"]
     usual = find_by_known_pipe(record, tmp_path / "usual.yaml", 0.95)
     assert usual["calibration_factor"] is None and usual["measured_factor"] is not None
@@ -131,7 +131,7 @@ def test_a_recording_gives_the_factor_and_the_usual_tolerances_do_not(tmp_path):
         write_blocks(factor_report(document), tmp_path / f"{document['verdict']}.html")
 
 
-def test_a_rigid_shaft_holds_no_string(tmp_path):
+def test_a_rigid_shaft_has_no_string(tmp_path):
     rigid = recording(0.0, 1)
     (tmp_path / "string.yaml").write_text(
         "sections: [{length_m: 2300, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}]\n"

@@ -89,7 +89,8 @@ def test_torques_at_the_main_shaft_are_divided_by_the_gear_ratio(tmp_path, capsy
     assert "gear ratio" in capsys.readouterr().err
     log_path = tmp_path / "run.mcap"
     log_path.write_bytes(b"of which only the hash is read")
-    log = RunRecord(recorded(np.arange(10.0), np.ones(10), np.ones(10), gear_ratio=1.1, torque_scale_rel_sd=0.02), {}, str(log_path))
+    recording = recorded(np.arange(10.0), np.ones(10), np.ones(10), gear_ratio=1.1, torque_scale_rel_sd=0.02)
+    log = RunRecord(recording, {}, str(log_path))
     monkeypatch.setattr(calibrate_reference, "_one_log", lambda *_: log)
     assert main([*words[:2], str(log_path), *words[2:]]) == 0
     assert json.loads(capsys.readouterr().out)["calibration_factor"]["value"] == pytest.approx(0.95)

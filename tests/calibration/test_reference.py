@@ -1,4 +1,4 @@
-"""A reference sensor's record beside a log: offset, band, coverage, and each refusal by name."""
+"""Record of a reference sensor beside a log: offset, frequency band, coverage, and each refusal by name."""
 
 import json
 from dataclasses import replace
@@ -28,12 +28,12 @@ def test_the_factor_the_offset_and_the_time_are_found(plain):
     assert plain.refusal == ""
     assert plain.factor.low <= bench.factor <= plain.factor.high and plain.factor.half_width_share < 0.01
     assert plain.offset_nm.low <= bench.offset_nm <= plain.offset_nm.high
-    # What the sensor's filter is slower or faster than the report's is a delay, too.
+    # A difference between the filters of sensor and report is also a delay.
     assert plain.time_offset_s == pytest.approx(
         bench.time_offset_s + bench.sensor_lag_s - bench.report_lag_s, abs=0.01)
 
 
-def test_the_budget_adds_up_and_holds_the_sensor_s_own_scale(plain):
+def test_the_budget_adds_up_and_contains_the_scale_of_the_sensor(plain):
     squares = np.sqrt(sum(line.of_factor**2 for line in plain.budget))
     assert squares * plain.factor.value == pytest.approx(plain.factor.standard_uncertainty, rel=1e-9)
     stated = found_of(SensorBench(), reference_rel_sd=0.01)
@@ -42,8 +42,8 @@ def test_the_budget_adds_up_and_holds_the_sensor_s_own_scale(plain):
 
 
 @pytest.mark.heavy
-def test_a_slow_sensor_of_another_rate_leaves_the_factor_alone():
-    """A filter of 0.5 s takes 3 % off a line at 0.08 Hz: without its variance in the fit κ would be that much off."""
+def test_a_slow_sensor_with_another_rate_does_not_change_the_factor():
+    """A filter of 0.5 s reduces a line at 0.08 Hz by 3 %. Without its variance in the fit, κ would have this error."""
     slow = found_of(SensorBench(sensor_lag_s=0.5, report_lag_s=0.0, sensor_rate_hz=17.0, report_noise_nm=0.3,
                                 sensor_noise_nm=0.3))
     assert slow.factor.value == pytest.approx(0.95, rel=0.004)
@@ -59,7 +59,7 @@ def test_correlated_residuals_widen_the_interval(plain):
 
 @pytest.mark.parametrize("runs", [pytest.param(30, marks=pytest.mark.heavy), pytest.param(200, marks=pytest.mark.long)])
 def test_the_interval_covers(runs):
-    """Offset, noise, delay, rate and low-pass filter are random."""
+    """Offset, noise, delay, rate and low-pass filter are random in each case."""
     covered = []
     for seed in range(runs):
         rng = np.random.default_rng([28, seed])
@@ -95,8 +95,8 @@ def test_what_cannot_be_calibrated_is_refused_by_name():
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.5])
-def test_a_tone_alone_tells_no_scale(lag_s):
-    """A sensor with a filter of 0.5 s shows 95 % of a tone of 0.1 Hz, as one with a wrong scale does."""
+def test_a_single_tone_gives_no_scale(lag_s):
+    """A sensor with a filter of 0.5 s shows 95 % of a tone of 0.1 Hz, like one with a wrong scale."""
     rng, time = np.random.default_rng(1), np.arange(0.0, 200.0, FINE_S)
     torque = 100.0 + 60.0 * np.sin(0.2 * np.pi * time)
     some = slice(10_000, None, 5)
@@ -105,7 +105,7 @@ def test_a_tone_alone_tells_no_scale(lag_s):
     assert "too few frequencies" in calibrate_reference(drive, sensor).refusal
 
 
-def test_a_value_that_is_no_number_or_a_time_that_goes_back_is_an_error():
+def test_a_value_that_is_no_number_or_a_time_that_decreases_is_an_error():
     drive, sensor = records(SensorBench(), np.random.default_rng(3))
     with pytest.raises(ValueError, match="no number"):
         calibrate_reference(drive, replace(sensor, torque_nm=np.full(len(sensor.time_s), np.nan)))
@@ -126,7 +126,7 @@ ROWS = [f"{0.1 * k:.1f},{k % 7}" for k in range(40)]
     ("time_s,torque [kg]\n" + "\n".join(ROWS), "is not a unit of torque"),
     ("", "empty"),
 ])
-def test_a_file_that_is_no_reference(tmp_path, text, words):
+def test_an_invalid_reference_file(tmp_path, text, words):
     path = tmp_path / "sensor.csv"
     path.write_text(text)
     assert main(["calibrate", "torque", str(path), "--reference", str(path)]) in (2, 10)
@@ -134,7 +134,7 @@ def test_a_file_that_is_no_reference(tmp_path, text, words):
         read_reference(path, parse_columns((), TIME_AND_TORQUE, REFERENCE_FLAG))
 
 
-def test_a_row_that_repeats_the_one_before_it_says_nothing_new(tmp_path):
+def test_a_repeated_row_has_no_effect(tmp_path):
     path = tmp_path / "sensor.csv"
     path.write_text("time_s,torque_nm\n" + "\n".join([*ROWS[:9], ROWS[8], *ROWS[9:]]))
     assert len(read_reference(path, parse_columns((), TIME_AND_TORQUE, REFERENCE_FLAG)).time_s) == len(ROWS)
@@ -145,7 +145,7 @@ def test_a_row_that_repeats_the_one_before_it_says_nothing_new(tmp_path):
 
 @pytest.fixture
 def files(tmp_path):
-    """A trace of the drive and a record of the sensor in kN·m, with other names."""
+    """Write a trace of the drive and a record of the sensor in kN·m, with other names."""
     drive, sensor = records(SensorBench(swing_nm=2000.0, duration_s=120.0), np.random.default_rng(5))
     (tmp_path / "drive.csv").write_text("time_s,speed_rad_s,torque_nm\n" + "".join(
         f"{t:.6f},3.0,{y:.3f}\n" for t, y in zip(drive.time_s, drive.torque_nm, strict=True)))

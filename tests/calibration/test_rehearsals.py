@@ -1,4 +1,4 @@
-"""No drive is calibrated by a run with scripted faults: torque-scale=1.1 would become its calibration factor."""
+"""Runs with scripted faults calibrate no drive: torque-scale=1.1 would become its calibration factor."""
 
 from __future__ import annotations
 

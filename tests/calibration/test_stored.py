@@ -1,4 +1,4 @@
-"""A calibration as a file: written, read, refused by name, applied to a recording, and carried by the log."""
+"""Calibration file: written, read, refused by name, applied to a recording, and contained in the log."""
 
 import json
 from dataclasses import replace
@@ -69,14 +69,14 @@ def test_the_file_is_read_again_and_never_written_over(document, tmp_path):
     ('{"kind": "torque_calibration", "calibration_factor": {"value": 1, "low": 2, "high": 3, "confidence": 0.95}}',
      "can't be"),
 ])
-def test_what_is_no_calibration(tmp_path: Path, text, words):
+def test_an_invalid_calibration(tmp_path: Path, text, words):
     path = tmp_path / "calibration.json"
     path.write_text(text)
     with pytest.raises(UsageError, match=words):
         load_calibration(path)
 
 
-def test_a_file_that_is_not_there(tmp_path: Path):
+def test_a_missing_file(tmp_path: Path):
     with pytest.raises(UsageError, match="no such file"):
         load_calibration(tmp_path / "calibration.json")
 
@@ -95,14 +95,14 @@ def test_another_drive_is_refused_before_motion_and_never_calibrated(document):
 
 
 @pytest.mark.heavy
-def test_an_old_calibration_is_named(document):
+def test_an_old_calibration_is_reported(document):
     old = {**RUN, "started": "2028-01-01T00:00:00+00:00", "torque_calibration": {**document, "valid_days": 100.0}}
     warnings = conclude(recording(0.0, 7), old, "run.mcap").identification.warnings
     assert any("valid for 100" in warning for warning in warnings)
 
 
 @pytest.mark.heavy
-def test_a_replay_takes_the_calibration_of_its_drive_only(document):
+def test_a_replay_accepts_the_calibration_of_its_drive_only(document):
     found = with_calibration(RUN, recording(0.0, 7), document, "calibration.json")
     assert found["torque_calibration"] == document
     with pytest.raises(UsageError, match="of another drive: its serial"):
@@ -120,8 +120,8 @@ def test_a_log_that_was_calibrated_before_is_calibrated_from_the_drives_own_unit
 
 
 @pytest.mark.heavy
-def test_a_log_of_the_calibration_itself_is_no_better_known_than_the_calibration(document):
-    """Its noise is in the factor and in J, with the same sign: the squares alone would be too narrow."""
+def test_a_log_of_the_calibration_is_as_uncertain_as_the_calibration(document):
+    """Its noise is in the factor and in J with the same sign. A sum of squares would be too narrow."""
     own = with_calibration(RUN, recording(0.0, 1), document, "calibration.json", document["runs"][0]["sha256"])
     other = with_calibration(RUN, recording(0.0, 1), document, "calibration.json", "0" * 64)
     assert other["torque_calibration"] == document

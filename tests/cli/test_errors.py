@@ -1,4 +1,4 @@
-"""Each error ends with the exit code that the manual promises."""
+"""Exit codes of errors, as in the manual."""
 
 import json
 import signal
@@ -20,6 +20,54 @@ from drivers.errors import (
 )
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode, Interrupted, UsageError, exit_code
+
+
+def one_document(capsys):
+    """Return the document on stdout: there is one, and nothing else."""
+    return json.loads(capsys.readouterr().out)
+
+
+SPEED = ["calibrate", "speed", "--turns", "100", "--seconds", "312.4", "--speed", "2.0", "--json"]
+
+
+def test_a_missing_folder_is_reported_before_the_result(tmp_path, capsys):
+    assert main([*SPEED, "--save", str(tmp_path / "none" / "c.json")]) == 2
+    assert "its folder does not exist" in one_document(capsys)["error"]["message"]
+
+
+def test_stdout_has_one_document_also_if_a_later_step_fails(tmp_path, capsys, monkeypatch):
+    def full(*_):
+        raise UsageError("can't be written (No space left on device)")
+
+    monkeypatch.setattr("tdhil.session.add_speed_calibration", full)
+    assert main([*SPEED, "--save", str(tmp_path / "c.json")]) == 2
+    out, err = capsys.readouterr()
+    assert json.loads(out)["calibration_factor"] is not None and "No space left" in err
+
+
+def test_a_json_file_that_is_nested_too_deeply_is_an_error_of_use(tmp_path, capsys):
+    path = tmp_path / "r.json"
+    path.write_text("[" * 200_000)
+    for words in (["tune", "speed", str(path)], ["tune", "soft-torque", str(path)]):
+        assert main([*words, "--json"]) == 2
+        assert one_document(capsys)["exit_code"] == 2
+
+
+def test_the_list_of_faults_is_a_document_too(capsys):
+    assert main(["identify", "--fault", "list", "--json"]) == 0
+    assert set(one_document(capsys)["buses"]) >= {"canopen", "modbus"}
+
+
+@pytest.mark.parametrize("every", ["-1", "0", "0.01"])
+def test_a_folder_is_not_polled_without_a_pause(tmp_path, capsys, every):
+    assert main(["watch", str(tmp_path), "--every", every]) == 2
+    assert "too short an interval" in capsys.readouterr().err
+
+
+def test_a_rig_gets_no_name_that_is_refused_later(tmp_path, capsys):
+    path = tmp_path / "rig.yaml"
+    assert main(["rig", "new", str(path), "--profile", "generic/cia402", "--load", "none", "--name", "x" * 300]) == 2
+    assert "too many" in capsys.readouterr().err and not path.exists()
 
 
 class LogErrorLike(TdhilError):
@@ -69,7 +117,7 @@ WITH_JSON = ("identify", "replay", "fleet", "watch", "trend", "compare", "tune",
 
 @pytest.mark.parametrize("command", WITH_JSON)
 @pytest.mark.parametrize("wrong", ["--no-such-option", "--json=yes"])
-def test_what_cant_be_understood_is_a_document_where_one_was_asked_for(
+def test_a_usage_error_is_a_document_if_json_is_requested(
     command: str, wrong: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*command.split(), "--json", wrong]) == 2
@@ -82,7 +130,7 @@ def test_what_cant_be_understood_is_a_document_where_one_was_asked_for(
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("flet", "Did you mean 'fleet'? "), ("xyzzy", "")])
-def test_a_command_that_there_is_not_is_named_with_what_was_meant(
+def test_an_unknown_command_is_reported_with_a_suggestion(
     typed: str, meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([typed, "logs"]) == 2
@@ -92,7 +140,7 @@ def test_a_command_that_there_is_not_is_named_with_what_was_meant(
 @pytest.mark.parametrize(("typed", "said"), [
     ("sped", "tdhil: tune: there is no action sped. Did you mean 'speed'? See tdhil tune --help [TDH-200]\n"),
     ("result.jsn", "tdhil: result.jsn: this file does not exist."),
-    ("verfy", "tdhil: verfy: this file does not exist."),         # here a file of that name is meant: it exists
+    ("verfy", "tdhil: verfy: this file does not exist."),         # this names an existing file
 ])
 def test_a_misspelt_action_is_no_file(
     typed: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -115,7 +163,7 @@ def test_without_json_a_wrong_value_is_a_line_on_stderr_alone(capsys: pytest.Cap
     assert shown.out == "" and shown.err.startswith("tdhil: identify: argument --excitation: invalid choice")
 
 
-def test_ctrl_c_is_called_by_its_name() -> None:
+def test_ctrl_c_is_named() -> None:
     assert "Ctrl-C" in str(Interrupted(signal.SIGINT))
     assert "SIGTERM" in str(Interrupted(signal.SIGTERM))
 
@@ -124,7 +172,7 @@ def test_ctrl_c_is_called_by_its_name() -> None:
     (None, "tdhil stops the shaft. Lower it"), (True, "The shaft was stopped. Lower it"),
     (False, "Standstill was not confirmed. Lower it"),
 ])
-def test_an_error_that_ends_a_motion_claims_a_stop_only_if_it_was_confirmed(stopped: bool | None, said: str) -> None:
+def test_an_error_that_ends_a_motion_states_a_stop_only_if_it_was_confirmed(stopped: bool | None, said: str) -> None:
     error = LimitHit("too fast", next_step="Lower it", stops=True)
     error.stopped = stopped
     assert (str(error), error.next_step) == (f"too fast. {said}", said)

@@ -1,4 +1,4 @@
-"""No file is overwritten, and every refusal has the same text: `tdhil.errors.existing_file`."""
+"""Existing files are never overwritten, and every refusal has the same text: `tdhil.errors.existing_file`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tdhil.cli.main import main
+from tdhil.cli.results import whole_or_none
 from tdhil.errors import UsageError
 from tdhil.service.client import Client
 
@@ -15,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 TEXT = "already exists and was not overwritten. Name another file, or move the existing one"
 VARIANTS = re.compile(r"there already|already exists and|left (?:as it is|unchanged|alone)|not overwritten")
 OTHERWISE = {"errors.py", "session/log_files.py"}
-"""The function itself, and the refusal of a file that is no log: an older log is kept under another name."""
+"""The function itself, and the refusal of a file that is no log, since an older log gets another name."""
 
 
 @pytest.mark.parametrize("command", [
@@ -42,8 +43,22 @@ def test_the_client_refuses_before_it_asks_for_the_file(tmp_path):
     assert (tmp_path / "log.mcap").read_text() == "mine"
 
 
-def test_no_other_text_says_so():
+def test_no_other_text_refuses_an_existing_file():
     found = [f"{path.relative_to(ROOT / 'tdhil')}: {text}" for path in sorted((ROOT / "tdhil").rglob("*.py"))
              for text in re.findall(r'UsageError\(\s*f?"([^"]*)"', path.read_text(encoding="utf-8"))
              if VARIANTS.search(text) and str(path.relative_to(ROOT / "tdhil")) not in OTHERWISE]
     assert found == []
+
+
+@pytest.mark.parametrize("ended_by", [OSError("No space left on device"), KeyboardInterrupt()])
+def test_a_file_whose_writing_ends_early_is_removed(tmp_path, ended_by):
+    """The rows before a full disk, or before Ctrl-C, passed for the whole file."""
+    target = tmp_path / "run.csv"
+    with pytest.raises(type(ended_by)), whole_or_none(target), target.open("x") as file:
+        file.write("time_s\n")
+        raise ended_by
+    assert not target.exists()
+    target.write_text("kept")
+    with pytest.raises(FileExistsError), whole_or_none(target):
+        target.open("x")
+    assert target.read_text() == "kept"

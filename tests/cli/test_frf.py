@@ -1,4 +1,4 @@
-"""`tdhil frf` on traces: the table, files that others read, several logs, and what has no response."""
+"""`tdhil frf` on traces: table, exported files, several logs, and data without a response."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def trace(tmp_path_factory):
     return write_trace(tmp_path_factory.mktemp("trace"), "run")
 
 
-def test_the_table_fits_eighty_columns_and_says_what_it_shows(trace, capsys, monkeypatch):
+def test_the_table_fits_eighty_columns_and_has_a_heading(trace, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert main(["frf", *trace]) == 0
     said = capsys.readouterr().out
@@ -99,7 +99,7 @@ def test_python_has_the_same_response(trace, capsys):
     assert np.abs(result.frf.response).tolist() == pytest.approx(sizes, rel=1e-14)
 
 
-def test_what_has_no_response_says_why_and_ends_with_9(tmp_path, capsys):
+def test_data_without_a_response_give_the_reason_and_end_with_9(tmp_path, capsys):
     one = write_trace(tmp_path, "one", periods=2)
     assert main(["frf", *one]) == 9
     assert "TDH-911" in capsys.readouterr().out
@@ -116,7 +116,7 @@ def test_what_has_no_response_says_why_and_ends_with_9(tmp_path, capsys):
     (["TRACE", "--out", "TRACE"], "TDH-209", "the log itself"),
     (["TRACE", "--out", "nowhere/frf.csv"], "TDH-206", "folder"),
 ])
-def test_mistakes_are_one_line(trace, words, code, said, capsys):
+def test_usage_errors_are_one_line(trace, words, code, said, capsys):
     assert main(["frf", *(trace[0] if word == "TRACE" else word for word in words)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and code in error and said in error

@@ -25,7 +25,7 @@ def _flags(text):
     return set(re.findall(r"^  (?:-\w \S+, )?(--[a-z][a-z-]+)", text, re.MULTILINE))
 
 
-def test_the_commands_stand_in_groups_of_one_line_each(capsys):
+def test_the_commands_are_in_groups_of_one_line_each(capsys):
     text = _help(capsys, "--help")
     assert all(len(line) <= 80 for line in text.splitlines())
     at = [text.index(f"\n{title}:\n") for title in _GROUPS]
@@ -84,7 +84,7 @@ def test_a_shell_completes_commands_and_options(shell, capsys):
         assert subprocess.run(["bash", "-n"], input=script.encode(), check=False).returncode == 0
 
 
-def test_without_shtab_it_says_what_to_install(capsys, monkeypatch):
+def test_without_shtab_it_names_the_package_to_install(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert main(["completion", "bash"]) == 2
     assert "pip install 'shtab" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""How `tdhil identify` ends: the code of each way to go wrong, and what is said, without a run behind it."""
+"""End of `tdhil identify`: exit code and message of each failure, without a run."""
 
 import json
 import os
@@ -37,7 +37,7 @@ CAUSES = {
 
 @pytest.fixture
 def ends(monkeypatch, tmp_path, capsys):
-    """``ends(cause, stop, verdict's code)``: (exit code, stdout, stderr) of a command whose run went so."""
+    """Return ``ends(cause, stop, verdict's code)``: (exit code, stdout, stderr) of a command with such a run."""
     monkeypatch.chdir(tmp_path)
 
     def ends(cause, stop, verdict=ExitCode.OK, *arguments):
@@ -63,17 +63,17 @@ def ends(monkeypatch, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("cause", [cause for cause in CAUSES if cause != "none"])
-def test_at_rest_the_cause_s_code(ends, cause):
+def test_at_standstill_the_exit_code_is_that_of_the_cause(ends, cause):
     error, code = CAUSES[cause]
     got, out, err = ends(error, REST)
     assert (got, out) == (code, "")
     assert str(error) in err and "the shaft is at standstill (seen at 12.2 s) and the drive is disabled" in err
     assert "tdhil replay run.mcap" in err and "hard-wired" not in err
-    assert ("ZeroDivisionError: ours" in err) is (cause == "mistake")      # where it is ours, with its traceback
+    assert ("ZeroDivisionError: ours" in err) is (cause == "mistake")      # for a bug, with its traceback
 
 
 @pytest.mark.parametrize("cause", CAUSES)
-def test_a_stop_that_nobody_saw_through_ends_with_8_whatever_came_before(ends, cause):
+def test_an_unconfirmed_stop_ends_with_8_for_any_cause(ends, cause):
     error, _ = CAUSES[cause]
     got, _, err = ends(error, TURNING)
     assert got == 8
@@ -91,7 +91,7 @@ def test_before_motion_nothing_moved(ends):
 @pytest.mark.parametrize(("stop", "code", "said"), [
     (REST, 7, "at standstill"), (TURNING, 8, "hard-wired emergency stop"),
 ])
-def test_the_document_says_the_same(ends, stop, code, said):
+def test_the_document_agrees(ends, stop, code, said):
     got, out, _ = ends(CAUSES["limit"][0], stop, ExitCode.OK, "--json")
     document = json.loads(out)
     assert got == document["exit_code"] == code
@@ -104,7 +104,7 @@ def test_the_document_says_the_same(ends, stop, code, said):
 
 
 @pytest.mark.parametrize("verdict", [ExitCode.OK, ExitCode.NOT_IDENTIFIABLE])
-def test_a_run_that_went_to_its_end_has_its_verdict_s_code(ends, verdict):
+def test_a_complete_run_has_the_exit_code_of_its_verdict(ends, verdict):
     got, out, err = ends(None, REST, verdict)
     assert got == verdict and json.loads(out) == {"verdict": "as the test has it"}
     assert "tdhil:" not in err
@@ -124,8 +124,8 @@ def test_a_log_that_could_not_be_finished_is_never_exit_0(ends, monkeypatch, cau
     assert bool(out) is (cause == "none")
 
 
-def test_what_the_log_ended_by_is_told_once(ends, monkeypatch):
-    """The run ended by it; closing it finds the same."""
+def test_the_error_of_the_log_is_reported_once(ends, monkeypatch):
+    """The error ended the run, and the close of the log finds the same error."""
     plain = RunLog.close
 
     def broken(self):
@@ -137,7 +137,7 @@ def test_what_the_log_ended_by_is_told_once(ends, monkeypatch):
     assert got == 3 and err.count("can't be written any more") == 1
 
 
-def test_the_result_stands_in_the_log(ends):
+def test_the_result_is_in_the_log(ends):
     from tdhil.recording.log_reader import read_run
 
     assert ends(None, REST)[0] == 0
@@ -149,7 +149,7 @@ def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
     number, former = signal.Signals[name], signal.getsignal(signal.Signals[name])
     with stop_on_signals() as request:
         assert request.signum is None
-        assert callable(signal.getsignal(number))      # else a stop signal would stop the tests
+        assert callable(signal.getsignal(number))      # otherwise a stop signal would stop the tests
         os.kill(os.getpid(), number)
         os.kill(os.getpid(), signal.SIGTERM)
         assert (request.signum, request.count) == (number, 2)
@@ -158,7 +158,7 @@ def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGQUIT", "SIGTERM", "SIGHUP", "SIGTSTP"])
 def test_a_signal_of_a_user_stops_the_run_also_if_the_program_around_ignores_it(name):
-    """A run under nohup, or in the background of a script, is stopped by each of them."""
+    """Each of them stops a run under nohup or in the background of a script."""
     number = signal.Signals[name]
     former = signal.signal(number, signal.SIG_IGN)
     try:
@@ -170,7 +170,7 @@ def test_a_signal_of_a_user_stops_the_run_also_if_the_program_around_ignores_it(
 
 
 KILLING = [number for number in sorted(signal.valid_signals()) if number not in {
-    # What can't be caught, what a broken program raises, what nobody is killed by, and what Python ignores already.
+    # Signals that cannot be caught, signals of a crash, harmless signals, and signals that Python ignores.
     signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGCHLD,
     signal.SIGCONT, signal.SIGURG, signal.SIGWINCH, signal.SIGPIPE, signal.SIGXFSZ, signal.SIGTTIN, signal.SIGTTOU,
 }]
@@ -178,13 +178,13 @@ KILLING = [number for number in sorted(signal.valid_signals()) if number not in 
 
 @pytest.mark.parametrize("number", KILLING)
 def test_every_signal_that_would_kill_the_host_is_a_request_to_stop(number):
-    # A test before may have left a handler: a real-time loop takes SIGXCPU for itself (`tdhil.session.real_time`).
+    # An earlier test may have left a handler: a real-time loop uses SIGXCPU (`tdhil.session.real_time`).
     former = signal.getsignal(number)
     if number != signal.SIGINT:
         signal.signal(number, signal.SIG_DFL)
     try:
         with stop_on_signals() as request:
-            signal.raise_signal(number)  # to this thread: os.kill may hand it to another one, which Python sees later
+            signal.raise_signal(number)  # to this thread; os.kill may deliver it to another one
             assert request.signum == number
     finally:
         signal.signal(number, signal.SIG_DFL if former is None else former)
@@ -195,7 +195,7 @@ def test_every_signal_that_would_kill_the_host_is_a_request_to_stop(number):
     assert end_of(int(error.exit_code), stop_confirmed=True) is State.STOPPED
 
 
-def test_a_signal_that_the_program_around_uses_itself_is_left_to_it():
+def test_a_signal_that_the_calling_program_handles_is_left_to_it():
     seen = []
     former = signal.signal(signal.SIGALRM, lambda number, frame: seen.append(number))
     try:
@@ -206,7 +206,7 @@ def test_a_signal_that_the_program_around_uses_itself_is_left_to_it():
         signal.signal(signal.SIGALRM, former)
 
 
-def test_a_run_that_such_a_signal_ended_says_so_in_its_log(ends):
+def test_a_run_ended_by_such_a_signal_has_it_in_its_log(ends):
     code, _, err = ends(Interrupted(signal.SIGUSR1), REST)
     assert code == 128 + signal.SIGUSR1
     assert "interrupted by SIGUSR1" in err
@@ -215,7 +215,7 @@ def test_a_run_that_such_a_signal_ended_says_so_in_its_log(ends):
     assert find_ended({"ended": {"exit_code": 77}}, ()).exit_code == 1
 
 
-def test_at_the_end_the_first_signal_interrupts_and_a_calm_end_none():
+def test_at_the_end_only_the_first_signal_interrupts():
     former = signal.getsignal(signal.SIGINT)
     with Ending(own_process=False) as ending:
         with pytest.raises(Interrupted):
@@ -223,11 +223,11 @@ def test_at_the_end_the_first_signal_interrupts_and_a_calm_end_none():
         os.kill(os.getpid(), signal.SIGTERM)
         assert (ending.code(0), ending.code(5)) == (130, 5)
     with Ending(own_process=False) as ending:
-        with stop_on_signals(ending.request) as request:       # a run's own handlers go before
+        with stop_on_signals(ending.request) as request:       # the handlers of a run have precedence
             os.kill(os.getpid(), signal.SIGUSR1)
             os.kill(os.getpid(), signal.SIGINT)
             assert request.signum == signal.SIGUSR1
-        os.kill(os.getpid(), signal.SIGINT)        # what had ended the run
+        os.kill(os.getpid(), signal.SIGINT)        # the cause of the end of the run
         assert ending.code(138) == 138
     with Ending(own_process=False) as ending:
         ending.calm()
@@ -239,7 +239,7 @@ def test_at_the_end_the_first_signal_interrupts_and_a_calm_end_none():
     assert signal.getsignal(signal.SIGINT) is former
 
 
-def test_in_a_process_of_its_own_signals_are_ignored_from_the_end_on():
+def test_in_its_own_process_signals_are_ignored_after_the_end():
     kept = {number: signal.getsignal(number) for number in KILLING}
     try:
         with Ending(own_process=True):
@@ -252,8 +252,8 @@ def test_in_a_process_of_its_own_signals_are_ignored_from_the_end_on():
 
 
 @pytest.mark.heavy
-def test_a_burst_of_signals_up_to_the_very_end_changes_nothing(tmp_path):
-    """Through the stop, while the log closes, and in the interpreter's own end."""
+def test_a_burst_of_signals_up_to_the_exit_has_no_effect(tmp_path):
+    """The signals come during the stop, while the log closes, and during the exit of the interpreter."""
     log = tmp_path / "run.mcap"
     child = subprocess.Popen(
         [sys.executable, "-m", "tdhil", "identify", "--simulate", "--seed", "1", "--log", str(log)],

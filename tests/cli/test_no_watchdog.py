@@ -1,4 +1,4 @@
-"""What is said of a run whose drive does not watch its host, and who may accept that."""
+"""Messages of a run whose drive has no watchdog, and the override for it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def preflight(watchdog_s: float) -> Preflight:
     )
 
 
-def test_the_confirmation_says_it_and_asks_for_somebody_at_the_stop() -> None:
+def test_the_confirmation_states_it_and_requires_an_operator_at_the_stop() -> None:
     armed = motion_summary(preflight(0.5), LIMITS, ExcitationRequest())
     assert "watchdog        0.5 s in the drive, then quick stop" in armed
     assert "--accept" not in armed
@@ -45,7 +45,7 @@ def test_the_confirmation_names_the_motion_of_a_run_without_an_excitation() -> N
     assert "excitation      multisine" in motion_summary(preflight(0.5), LIMITS, ExcitationRequest())
 
 
-def test_it_is_not_the_default_and_no_file_says_it(tmp_path: Path) -> None:
+def test_it_is_not_the_default_and_no_file_sets_it(tmp_path: Path) -> None:
     assert not LIMITS.accept_no_watchdog
     assert not machine_limits(simulated_default_rig()).accept_no_watchdog
     assert machine_limits(simulated_default_rig(), accept_no_watchdog=True).accept_no_watchdog
@@ -55,14 +55,14 @@ def test_it_is_not_the_default_and_no_file_says_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("found", [None, preflight(0.5)])
-def test_where_one_is_armed_nothing_is_changed(found: Preflight | None) -> None:
+def test_an_armed_watchdog_changes_no_message(found: Preflight | None) -> None:
     error = CommunicationLost("no feedback", next_step=ACTS)
     preconditions.correct(error, found)
     assert error.next_step == ACTS
     assert found is None or preconditions.configuration(found) == {}
 
 
-def test_where_none_is_armed_nobody_is_told_that_it_acts() -> None:
+def test_without_an_armed_watchdog_no_message_promises_its_reaction() -> None:
     found = preflight(0.0)
     error = CommunicationLost("no feedback", where="node 1", next_step=ACTS)
     preconditions.correct(error, found)
@@ -77,5 +77,5 @@ def test_where_none_is_armed_nobody_is_told_that_it_acts() -> None:
 
 @pytest.mark.parametrize("run", [{}, {"watchdog": None}, {"watchdog": 3}, {"watchdog": {"armed": True}},
                                  {"watchdog": {"armed": 0}}, {"watchdog": ["armed"]}])
-def test_a_log_that_does_not_say_so_warns_of_nothing(run: dict[str, object]) -> None:
+def test_a_log_without_this_entry_gives_no_warning(run: dict[str, object]) -> None:
     assert preconditions.precondition_warnings(run) == ()

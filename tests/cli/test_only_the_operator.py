@@ -1,4 +1,4 @@
-"""What a person at the shaft answers for is said on the command line of the run; no file says it for him."""
+"""Confirmations and overrides of the operator: only on the command line of the run, never in a file."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_an_override_in_a_file_is_for_the_profile_of_that_file(tmp_path):
     assert (both.accept_unverified, both.source("accept_unverified")) == (("watchdog",), "--accept-unverified")
 
 
-def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
+def test_without_standard_input_there_is_no_operator_at_the_prompt(monkeypatch):
     from types import SimpleNamespace
 
     from rich.console import Console

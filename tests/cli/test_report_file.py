@@ -1,4 +1,4 @@
-"""One head for every report: letterhead, customer, order number and place."""
+"""Head of every report: letterhead, customer, order number and place."""
 
 import argparse
 
@@ -101,7 +101,7 @@ def test_the_runs_state_the_head_and_the_command_line_replaces_it(tmp_path, caps
     assert "different" not in capsys.readouterr().err
 
 
-def test_runs_that_disagree_state_nothing_and_the_person_reads_it(tmp_path, capsys):
+def test_runs_with_different_heads_give_none_and_a_message(tmp_path, capsys):
     runs = [{"customer": "A&B", "place": 7}, {"customer": "C"}]
     text = _written(tmp_path, {}, runs, Letterhead("Nordwerk"))
     assert "A&amp;B" not in text and "Customer" not in text and "Place" not in text and "Nordwerk" in text

@@ -1,4 +1,4 @@
-"""`tdhil severity` from CSV: one record, two records, the card's width, the page, and mistakes."""
+"""`tdhil severity` from CSV: one record, two records, width of the card, page, and usage errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOTOR = ("--gear", "10")
 
 @pytest.fixture
 def bench(tmp_path):
-    """Two records of a motor with a gear of 10: the string swings by 5.6 kN·m every 8.16 s, and by a tenth of it."""
+    """Write two records of a motor with a gear of 10: oscillation of 5.6 kN·m with 8.16 s, and a tenth of it."""
     (tmp_path / "result.json").write_text(json.dumps(result(torque_lag_s=None)), encoding="utf-8")
     time_s = 0.05 * np.arange(6000)
     swing = np.sin(2.0 * np.pi * time_s / 8.16)
@@ -59,7 +59,7 @@ def test_the_printed_intervals_contain_those_of_the_document(bench, capsys):
         assert float(ends[0]) <= found[key]["low"] <= found[key]["high"] <= float(ends[1]), name
 
 
-def test_j_of_a_rehearsal_marks_what_is_computed_from_it(bench, capsys):
+def test_j_of_a_rehearsal_marks_the_values_derived_from_it(bench, capsys):
     rehearsed = result(torque_lag_s=None) | {"simulated": True, "rehearsed_faults": ["torque-scale=1.1"]}
     (bench / "result.json").write_text(json.dumps(rehearsed), encoding="utf-8")
     assert "· SIMULATED · FAULT REHEARSAL" in " ".join(ran(bench, capsys)[1].split())
@@ -67,7 +67,7 @@ def test_j_of_a_rehearsal_marks_what_is_computed_from_it(bench, capsys):
 
 @pytest.mark.parametrize("option", ["--excitation", "--motion-kind", "--motion-lines"])
 def test_options_of_a_motion_are_not_accepted(bench, capsys, option):
-    """A record of ordinary drilling has no periodic motion, and nothing is fitted to one."""
+    """A record of normal drilling has no periodic motion, so no motion is fitted."""
     code, _, err = ran(bench, capsys, option, "sine")
     assert code == 2 and f"there is no option {option}" in err
 
@@ -89,7 +89,7 @@ def test_two_records_side_by_side_in_80_columns_and_as_a_page(bench, capsys):
     ({"verdict": "not_identifiable", "inertia_kg_m2": None}, 11, "the result has no J"),
     ({}, 2, "a controller"),
 ])
-def test_mistakes(bench, capsys, change, code, message):
+def test_usage_errors(bench, capsys, change, code, message):
     (bench / "result.json").write_text(json.dumps(result(**change)), encoding="utf-8")
     other = bench / "tune.json"
     other.write_text(json.dumps({"main_shaft": {}, "string": {}, "controllers": [], "identified": {}}))
@@ -101,7 +101,7 @@ def test_mistakes(bench, capsys, change, code, message):
 
 
 def controller_file(bench, refused=""):
-    """Write what `tune --json` writes of one soft controller, a = 0.35 of the reference case."""
+    """Write the output of `tune --json` for one soft controller, a = 0.35 of the reference case."""
     main = {"inertia_kg_m2": {"value": 1500.0, "low": 1440.0, "high": 1560.0}, "viscous_nm_s_rad": 8.0,
             "coulomb_nm": 60.0, "inner_lags_s": [0.02, 0.01, 0.003]}
     gains = {"gain_nm_s_rad": 847.1, "integral_nm_rad": 705.1, "compensated_kg_m2": 0.0, "derivative_filter_s": 0.05}
@@ -113,7 +113,7 @@ def controller_file(bench, refused=""):
 
 
 def test_the_reflection_of_the_record_is_compared_with_that_of_the_gains(bench, capsys):
-    """The top of the record hardly moves: it sends nearly all of a wave back, unlike a top with soft gains."""
+    """The top of the record hardly moves and reflects nearly all of a wave, unlike a top with soft gains."""
     code, out, err = ran(bench, capsys, *controller_file(bench), "--json")
     assert code == 0, err
     (found,) = json.loads(out)["records"]

@@ -1,4 +1,4 @@
-"""`tdhil tune` from a result's file: gains at both shafts and in the drive's units, refusals, and mistakes in files."""
+"""`tdhil tune` from the file of a result: gains at both shafts and in the drive's units, refusals, errors in files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def result(**said):
 
 @pytest.fixture
 def tuned(tmp_path, capsys):
-    """Run it, without the simulation: (exit code, document or text, stderr)."""
+    """Run it without the simulation; return (exit code, document or text, stderr)."""
     def run(*words, string=STRING_YAML, as_json=True, **said):
         path = tmp_path / "result.json"
         path.write_text(json.dumps(result(**said)), encoding="utf-8")
@@ -78,7 +78,7 @@ def test_gains_stand_at_main_shaft_and_motor_and_in_the_drives_parameters(tuned)
 
 
 @pytest.mark.heavy
-def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
+def test_the_terminal_shows_the_basis_and_the_parameters(tuned):
     code, text, _ = tuned("--inner-lags", "20ms", "10ms", "3ms", "--profile", "abb/acs880-enhanced", as_json=False,
                           rehearsed_faults=["torque-scale=1.1"])
     assert code == 0
@@ -94,7 +94,7 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
 
 @pytest.mark.heavy
 def test_the_card_names_unstable_present_gains_and_no_warning_of_numpy_is_shown(tmp_path, capsys):
-    """The signals of the present loop grow beyond the largest number. stderr has lines of progress only."""
+    """The signals of the present loop overflow. stderr has lines of progress only."""
     path = tmp_path / "result.json"
     path.write_text(json.dumps(result(inertia_kg_m2=estimate(1.0, 0.96, 1.04))), encoding="utf-8")
     with warnings.catch_warnings():
@@ -137,25 +137,25 @@ def test_over_the_bus_the_reported_speeds_lag_is_in_the_loop(tuned):
 
 
 def compliant(**said):
-    """The reference case's string as the two-mass model has it, at the motor of a gear of 10."""
+    """Return the string of the reference case as a two-mass model, at a motor with a gear of 10."""
     return {"stiffness_nm_rad": interval(3.14, 3.0, 3.3), "antiresonance_hz": interval(0.1299, 0.128, 0.132),
             "damping_nm_s_rad": None, **said}
 
 
 @pytest.mark.heavy
-def test_without_a_string_k_and_j_l_are_as_the_result_has_them(tuned):
+def test_without_a_string_k_and_j_l_are_those_of_the_result(tuned):
     code, document, _ = tuned(string=None, model="two-mass", compliant=compliant())
     assert code == 0
     assert document["string"]["stiffness_nm_rad"] == pytest.approx(314.0)
     assert document["string"]["modes_hz"][0] == pytest.approx(0.1299, rel=1e-4)
     assert document["string"]["name"] == "k and J_L as identified (two-mass)"
     soft = document["controllers"][1]
-    # I = (φω)² J has what is open of ω
+    # I = (φω)² J contains the uncertainty of ω
     assert soft["least_damping"]["value"] > 0.1
     own = soft["integral_nm_rad_by_inertia"]
     assert own["low"] / own["value"] == pytest.approx(1.0 - math.hypot(0.04, 0.029), abs=0.002)
     assert any("Describe the pipe in a string.yaml" in warning for warning in document["warnings"])
-    # nothing that rests on waves which nobody has seen
+    # no value that depends on unmeasured waves
     assert [one["kind"] for one in document["controllers"] if one["refused"]] == ["compensated", "broadband"]
     code, document, _ = tuned("--compensate", "0.2", string=None, compliant=compliant())
     assert code == 11 and "State the pipe in string.yaml" in document["error"]["message"]
@@ -171,7 +171,7 @@ def test_without_either_the_string_is_asked_for(tuned, said, words):
     assert words in document["error"]["message"]
 
 
-def test_files_that_are_none_are_named(tmp_path, capsys):
+def test_invalid_files_are_named(tmp_path, capsys):
     wrong = tmp_path / "wrong.json"
     for text, message in (("{}", "not a result of tdhil identify"), ("not json", "neither a log nor JSON")):
         wrong.write_text(text, encoding="utf-8")
@@ -188,7 +188,7 @@ def test_files_that_are_none_are_named(tmp_path, capsys):
 
 @pytest.mark.heavy
 def test_the_interval_of_the_stiff_cure_speed_contains_a_fine_simulation():
-    """J is exact, so the interval is only the error of the simulation. A third of the tick, and twice the length."""
+    """J is exact, so the interval is the simulation error. The fine one has a third of the step, twice the length."""
     tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1500.0, 1500.0)), None)
     stiff = tuning.by_kind("stiff")
     found = lowest_turning(STRING, [(DRIVE, stiff.controller)], "stuck", Search())
@@ -200,12 +200,12 @@ def test_the_interval_of_the_stiff_cure_speed_contains_a_fine_simulation():
     (truth,) = lowest_turning(STRING, [(DRIVE, stiff.controller)], "stuck", fine)
     assert cure["value"] == found[0]
     assert cure["low"] <= truth <= cure["high"]
-    assert 2.0 <= 0.5 * (cure["high"] - cure["low"]) <= 5.0      # not ±0, and of use
+    assert 2.0 <= 0.5 * (cure["high"] - cure["low"]) <= 5.0      # not ±0, and small enough
 
 
 @pytest.mark.heavy
 def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
-    """Stick-slip is shown at a set speed between the two cure speeds, here given and not searched for."""
+    """Stick-slip is shown at a set speed between the two cure speeds, which are given here, not searched."""
     pytest.importorskip("matplotlib")
     tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0)), None)
     cures = {"stiff": None, "soft": 61.0}
@@ -217,7 +217,7 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     document = tuning_document(tuning, TunedFor("result.json", True, None, 1.0, "drive", "as stated"))
     json.dumps(document, allow_nan=False)
     stiff, soft = document["controllers"][:2]
-    assert stiff["critical_rpm"]["cure"]["value"] is None      # above all that were tried
+    assert stiff["critical_rpm"]["cure"]["value"] is None      # above all tested speeds
     cure = soft["critical_rpm"]["cure"]
     assert cure["value"] == 61.0
     assert 58.5 < cure["low"] < 60.0 and 62.0 < cure["high"] < 63.5      # the simulation's own error
@@ -238,7 +238,7 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
 
 
 def impedance(**said):
-    """What identify --impedance says, at the motor."""
+    """Return the result of identify --impedance, at the motor."""
     loop = {"gain_nm_s_rad": estimate(203.0, 200.0, 206.0), "integral_nm_rad": estimate(264.5, 260.0, 269.0),
             "torque_lag_s": estimate(0.012, 0.01, 0.014), "speed_filter_s": estimate(0.021, 0.018, 0.024),
             "inner_lag_s": estimate(0.033, 0.032, 0.034)}
@@ -256,20 +256,20 @@ def measured(tmp_path):
 
 
 @pytest.mark.heavy
-def test_the_drives_present_gains_stand_beside_the_others_with_its_own_lags(tuned, measured):
+def test_the_present_gains_of_the_drive_are_beside_the_others_with_its_own_lags(tuned, measured):
     code, document, _ = tuned(*measured())
     assert code == 0
     present, stiff = document["controllers"][:2]
     assert (present["kind"], stiff["kind"]) == ("present", "stiff")
     assert present["at_main_shaft"]["gain_nm_s_rad"] == pytest.approx(20300.0)
     assert present["at_motor"]["integral_nm_rad"] == pytest.approx(264.5)
-    # these are the reference case's stiff gains: what they do to its string is known from the notes
+    # the stiff gains of the reference case: their effect on its string is known
     assert present["reflection_at_lowest_mode"]["value"] == pytest.approx(0.992, abs=0.002)
     assert present["least_damping"]["value"] == pytest.approx(0.036, abs=0.003)
     assert present["inertia_wrong_by"] == []
     assert document["main_shaft"]["inner_lags_s"] == [0.021, 0.012]
     assert document["main_shaft"]["inner_lags_from"] == "as measured (--impedance)"
-    # each is known to 2 or 3 ms, and their sum to one: both go in as they hang together
+    # each is known to 2 or 3 ms, and their sum to 1 ms: they are used with their covariance
     assert document["main_shaft"]["inner_lag_s"] == pytest.approx(interval(0.033, 0.032, 0.034))
     open_of = [one["reflection_at_lowest_mode"]["high"] - one["reflection_at_lowest_mode"]["low"]
                for one in (present, stiff)]
@@ -286,7 +286,7 @@ def test_the_table_has_a_column_for_them(tuned, measured):
 
 
 @pytest.mark.heavy
-def test_stated_lags_go_before_measured_ones(tuned, measured):
+def test_stated_lags_take_precedence_over_measured_ones(tuned, measured):
     _, document, _ = tuned(*measured(), "--inner-lags", "20ms", "10ms")
     assert document["main_shaft"]["inner_lags_s"] == [0.02, 0.01]
 
@@ -298,15 +298,15 @@ def test_stated_lags_go_before_measured_ones(tuned, measured):
     ({"gear_ratio": 4.0}, ExitCode.USAGE, "gear ratio"),
     ({"simulated": False}, ExitCode.USAGE, "is of a real drive, and the result is of a simulated one"),
 ])
-def test_what_is_no_measured_impedance_of_this_shaft_is_refused(tuned, measured, said, code, words):
+def test_an_impedance_of_another_shaft_is_refused(tuned, measured, said, code, words):
     found, _, err = tuned(*measured(**said), as_json=False)
     assert found == code
     assert words in err
 
 
 @pytest.mark.heavy
-def test_the_first_sentence_says_what_was_not_compared_and_what_changes(tuned):
-    """Typed gains are a row like the others, and the sentence compares with them. Nothing was simulated: no advice."""
+def test_the_first_sentence_states_missing_comparisons_and_changes(tuned):
+    """Typed gains are a row like the others, and the sentence compares with them. No simulation: no advice."""
     code, document, _ = tuned("--present", "40", "30")
     assert code == 0
     assert [one["kind"] for one in document["controllers"]][:2] == ["present", "stiff"]
@@ -324,7 +324,7 @@ def test_the_first_sentence_says_what_was_not_compared_and_what_changes(tuned):
 
 @pytest.mark.heavy
 def test_without_a_bit_nothing_is_green(tuned, tmp_path):
-    """The identified string has no bit: nothing was compared, and the answer says which entry is needed."""
+    """The identified string has no bit. There is no comparison, and the message names the required entry."""
     words = "--report", str(tmp_path / "tune.html")
     code, document, _ = tuned("--present", "40", "30", *words, string=None, model="two-mass", compliant=compliant())
     assert code == 0
@@ -362,7 +362,7 @@ def test_a_measured_lag_of_zero_is_drawn_within_its_interval(tmp_path):
 
 
 def test_a_very_soft_request_is_refused_with_its_margin(tuned):
-    """a = 5 damps by 0.02, less than the stiff loop: it ends with 11, and says which margin is missing."""
+    """a = 5 damps by 0.02, less than the stiff loop. The command ends with 11 and names the missing margin."""
     code, document, _ = tuned("--a", "5")
     assert code == 11
     assert "a = 5 leaves too little margin: phase margin" in document["error"]["message"]
@@ -370,15 +370,15 @@ def test_a_very_soft_request_is_refused_with_its_margin(tuned):
 
 
 @pytest.mark.heavy
-def test_thin_present_gains_are_told_in_words(tuned):
-    """Gains that lose all phase somewhere in the sampled cases are named with the number and the limit."""
+def test_present_gains_with_small_margins_are_reported_in_words(tuned):
+    """Gains that lose all phase in a sampled case are reported with the value and the limit."""
     code, text, _ = tuned("--present", "2.965", "9.993", as_json=False)
     assert code == 0
     assert "present: thin margins, phase margin" in " ".join(text.split())
 
 
 @pytest.mark.heavy
-def test_other_margins_can_be_asked_for(tuned):
+def test_other_margins_can_be_requested(tuned):
     _, document, _ = tuned("--margins", "45", "9", "50ms")
     assert document["required_margins"] == {"phase_deg": 45.0, "gain_db": 9.0, "dead_time_s": 0.05}
     for one in document["controllers"]:
@@ -390,7 +390,7 @@ def test_other_margins_can_be_asked_for(tuned):
 
 @pytest.mark.heavy
 def test_an_identified_pipe_keeps_its_impedance(tuned):
-    """k, f and J_L known to 0.3 % leave one uniform pipe: ζ 296 of the reference case, and compensation is possible."""
+    """k, f and J_L known to 0.3 % fit one uniform pipe only: ζ 296 of the reference case. Compensation is possible."""
     def near(value):
         return interval(value, value * 0.997, value * 1.003)
 
@@ -462,11 +462,11 @@ def test_j_and_string_are_drawn_jointly_from_the_covariance_of_the_result(correl
     assert len(case.inertia_draws) == len(case.string_draws)
     assert np.corrcoef(drawn[:, :2].T)[0, 1] == pytest.approx(correlation, abs=0.03)
     assert np.exp(drawn[:, 0]).std() == pytest.approx(60.0 / 1.96, rel=0.1)
-    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2] - drawn[:, 1])[0, 1]) < 0.1     # J and k/J_L: independent as stated
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2] - drawn[:, 1])[0, 1]) < 0.1     # J and k/J_L: independent
 
 
 def test_the_torque_scale_multiplies_j_and_k_alike():
-    """J is known to 0.1 % but for a scale of ±4 %: J and k then have this factor in common."""
+    """J is known to 0.1 %, plus a common scale of ±4 % in J and k."""
     scaled = {**estimate(15.0, 14.4, 15.6), "low": 14.985, "high": 15.015}
     near = interval(3.14, 3.137, 3.143)
     shaft = compliant(stiffness_nm_rad=near, covariance=covariance_of(-0.9))
@@ -478,7 +478,7 @@ def test_the_torque_scale_multiplies_j_and_k_alike():
 @pytest.mark.heavy
 @pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.9])
 def test_the_ends_of_the_intervals_have_the_covariance_of_j_and_string(correlation):
-    """I = (φω)² J has the relative variance s_J² + 4 s_ω² + 4 ρ s_J s_ω. One by one, the last term is omitted."""
+    """I = (φω)² J has the relative variance s_J² + 4 s_ω² + 4 ρ s_J s_ω. Separate intervals omit the last term."""
     exact = {**estimate(15.0, 14.4, 15.6), "low": 14.4, "high": 15.6}
     shaft = compliant(antiresonance_hz=interval(0.13, 0.1274, 0.1326), covariance={
         "quantities": ["inertia_kg_m2", "antiresonance_hz"], "matrix": [[1.0, correlation], [correlation, 1.0]]})
@@ -496,7 +496,7 @@ def test_without_a_covariance_j_and_string_are_drawn_independently():
 
 
 def test_severity_takes_the_identified_string_too():
-    """It needs the string only, and a result without J states no joint draws."""
+    """The command needs the string only. A result without J has no joint draws."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     said = result(model="two-mass", compliant=compliant(covariance=covariance_of(0.5)))
@@ -539,7 +539,7 @@ def test_a_map_without_its_bit_is_refused(tuned, tmp_path):
 
 @pytest.mark.heavy
 def test_depths_give_a_schedule_with_the_drives_parameters(tuned):
-    """Each row has gains at both shafts and what to type; what lies between the rows is told in a sentence."""
+    """Each row has gains at both shafts and the parameters. A sentence describes the range between the rows."""
     code, document, _ = tuned("--depths", "1000:3000:1000", profile={"name": "siemens/s120-canopen"})
     assert code == 0
     schedule = document["schedule"]
@@ -555,7 +555,7 @@ def test_depths_give_a_schedule_with_the_drives_parameters(tuned):
 
 
 @pytest.mark.parametrize("text", ["500", "500:400:10", "500:6000:9000", "1:6000:1", "a:b:c"])
-def test_depths_that_are_none_are_refused(tuned, text):
+def test_invalid_depths_are_refused(tuned, text):
     code, _, _err = tuned("--depths", text)
     assert code == ExitCode.USAGE
 
@@ -567,7 +567,7 @@ def test_a_schedule_needs_the_string(tuned):
 
 @pytest.mark.heavy
 def test_the_picture_of_a_schedule_is_drawn(tmp_path):
-    """With and without critical speeds, and with a depth that is refused."""
+    """The cases are with and without critical speeds, and with a refused depth."""
     figure = pytest.importorskip("matplotlib.figure")
     from tdhil.report.schedule import draw_schedule
 
@@ -584,8 +584,8 @@ def test_the_picture_of_a_schedule_is_drawn(tmp_path):
         drawn.savefig(tmp_path / "schedule.svg")
 
 
-def test_a_missing_string_is_told_before_the_log_is_identified(tmp_path, monkeypatch, capsys):
-    """Identifying a log again takes seconds: the files are checked first."""
+def test_a_missing_string_is_reported_before_the_log_is_identified(tmp_path, monkeypatch, capsys):
+    """A new identification of a log takes seconds, so the files are checked first."""
     log = tmp_path / "run.mcap"
     log.write_bytes(b"\x89MCAP0\r\n")
     monkeypatch.setattr("tdhil.cli.tune_soft_torque.read_result", lambda path: pytest.fail("the result was read first"))
@@ -594,7 +594,7 @@ def test_a_missing_string_is_told_before_the_log_is_identified(tmp_path, monkeyp
 
 
 @pytest.mark.heavy
-def test_a_tuning_that_evaluate_refuses_says_so(tmp_path, capsys):
+def test_a_tuning_that_evaluate_refuses_is_reported(tmp_path, capsys):
     path = tmp_path / "result.json"
     path.write_text(json.dumps(result()))
     assert main(["tune", str(path), "--string", str(STRING_YAML), "--no-simulation", "--json"]) == 0
@@ -602,7 +602,7 @@ def test_a_tuning_that_evaluate_refuses_says_so(tmp_path, capsys):
 
 
 def test_at_a_terminal_each_step_moves_until_the_next():
-    """Tuning takes a minute: elsewhere each step is a line, at a terminal the present one also has a moving sign."""
+    """Tuning takes a minute. Each step is a line; at a terminal the present one also has a moving sign."""
     from rich.console import Console
 
     from tdhil.cli.tune_soft_torque import _progress
@@ -623,7 +623,7 @@ def test_the_old_call_means_soft_torque(tmp_path, capsys):
         assert main([*words, str(path), "--string", str(STRING_YAML)]) == 11
         said.append(capsys.readouterr().err)
     assert said[0] == said[1] and "no J to tune for" in said[0]
-    assert main(["tune", "--string", str(STRING_YAML), str(path)]) == 11      # options first, as before
+    assert main(["tune", "--string", str(STRING_YAML), str(path)]) == 11      # options first, as in the old form
     with pytest.raises(SystemExit):
         main(["tune", "--help"])
     assert "speed|verify|soft-torque" in capsys.readouterr().out
@@ -652,7 +652,7 @@ def test_the_bit_noise_of_a_record_replaces_the_assumed_one(tuned, tmp_path):
     ({"rms_nm": {}}, STRING_YAML, 2, "is not a result of tdhil severity"),
     (NOISE, None, 2, "--bit-noise needs the string"),
 ])
-def test_a_bit_noise_that_is_none_is_refused(tmp_path, capsys, noise, string, code, message):
+def test_an_invalid_bit_noise_is_refused(tmp_path, capsys, noise, string, code, message):
     (tmp_path / "result.json").write_text(json.dumps(result()), encoding="utf-8")
     named = [] if string is None else ["--string", str(string)]
     seen = main(["tune", str(tmp_path / "result.json"), *named, "--no-simulation", "--bit-noise",

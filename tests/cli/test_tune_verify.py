@@ -65,7 +65,7 @@ def test_a_file_of_another_kind_is_named_with_the_command_that_writes_it(tmp_pat
     ({"reported_speed_lag_s": None}, (), "has no lag of the reported speed"),
     ({"plant": {}}, (), "is not a tuning that tdhil tune speed wrote"),
 ])
-def test_a_file_that_tells_too_little_is_refused_before_motion(tuned, capsys, tmp_path, change, words, message):
+def test_an_incomplete_file_is_refused_before_motion(tuned, capsys, tmp_path, change, words, message):
     document, path = tuned
     path.write_text(json.dumps(document | change), encoding="utf-8")
     code = main(["tune", "verify", str(path), "--simulate", "--log", str(tmp_path / "v.mcap"), *words])
@@ -74,7 +74,7 @@ def test_a_file_that_tells_too_little_is_refused_before_motion(tuned, capsys, tm
 
 
 @pytest.mark.heavy
-def test_a_run_finds_the_gain_that_was_typed_wrongly_and_its_replay_says_the_same(tuned, capsys, tmp_path):
+def test_a_run_finds_a_wrongly_entered_gain_and_its_replay_agrees(tuned, capsys, tmp_path):
     document, path = tuned
     gains = document["controllers"][-1]
     log, page = tmp_path / "v.mcap", tmp_path / "v.html"
@@ -100,7 +100,7 @@ def test_a_run_finds_the_gain_that_was_typed_wrongly_and_its_replay_says_the_sam
 
 
 def check_aborted(log, live, pairs):
-    """An abort in the step after ``pairs``, whose samples do not end there: the stop would be the step's response."""
+    """Check an abort in the step after ``pairs``. Its samples continue, so the stop would be its response."""
     record = read(log)
     starts, half_s = record.configuration["verification"]["starts_s"], live["steps"]["half_s"]
     end_s = starts[2 * pairs + 1] + half_s + MARGIN_S + 0.5 * half_s       # the first pair does not count

@@ -1,4 +1,4 @@
-"""A command that identifies again takes seconds: at a terminal it shows that it works, elsewhere it prints no sign."""
+"""Sign of activity of a command that identifies again for seconds: at a terminal only."""
 
 import io
 
@@ -30,7 +30,7 @@ def logs(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("command", "sign"), COMMANDS)
-def test_at_a_terminal_a_sign_moves_while_a_log_is_identified(logs, command, sign, monkeypatch, capsys):
+def test_at_a_terminal_there_is_a_moving_sign_during_identification(logs, command, sign, monkeypatch, capsys):
     out = io.StringIO()
     monkeypatch.setattr("tdhil.report.console.stderr_console",
                         lambda: Console(file=out, force_terminal=True, width=80))

@@ -1,4 +1,4 @@
-"""A room has a ceiling: it grows beyond it only with a decision record that says why."""
+"""Each room has a ceiling of source lines. It grows beyond the ceiling only with a decision record."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ CEILINGS = {
     "tdhil/config": (1_800, FIRST),
     "tdhil/estimation": (15_000, "0079"),
     "tdhil/evidence": (1_400, FIRST),
-    "tdhil/fleet": (2_100, FIRST),
+    "tdhil/fleet": (2_200, "0089"),
     "tdhil/recording": (5_400, FIRST),
     "tdhil/report": (7_000, "0082"),
     "tdhil/runner": (12_000, FIRST),
-    "tdhil/service": (11_900, FIRST),
+    "tdhil/service": (12_100, "0089"),
     "tdhil/session": (4_500, FIRST),
     "tdhil/soft_torque": (6_100, "0087"),
     "tdhil/speed_loop": (1_500, FIRST),
     "tdhil/studies": (6_100, FIRST),
-    "drivers": (12_700, FIRST),
+    "drivers": (13_300, "0089"),
     "sim_bus": (12_000, FIRST),
     "profiles": (4_600, FIRST),
 }
 RESERVE = 0.25
-"""A ceiling that is further above the lines than this share holds nothing: lower it."""
+"""Share by which a ceiling may exceed the lines. A higher ceiling has no effect and must be lowered."""
 IN_ANOTHER = {"tdhil": "*.py"}
-"""Rooms whose folder holds other rooms: only the files beside these count."""
+"""Rooms whose folder contains other rooms; only the files beside these count."""
 
 
 def lines_of(room: str) -> int:

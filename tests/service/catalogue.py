@@ -25,13 +25,13 @@ SERVICE = ROOT / "tdhil" / "service"
 SCRIPTS = sorted(one for one in (SERVICE / "static").glob("*.js") if not one.name.startswith("uPlot"))
 TEMPLATES = sorted((SERVICE / "templates").glob("*.html"))
 ELSEWHERE = {"client.py", "console.py", "mail.py", "mqtt.py", "server.py", "webhook.py", "password_file.py", "audit.py"}
-"""Modules of the service whose errors no page shows: they are of the terminal."""
+"""Modules of the service whose errors no page shows, since they belong to the terminal."""
 _ERRORS = re.compile(r"(Error|Refused|ValuesWrong|NotAllowed|Conflict|NotThere|NoRoom|TooLarge|TooSlow|NotLoggedIn"
                      r"|TooManyTries|NotReacting|request_wrong|option_wrong|page_text)$")
 
 
 class Text(NamedTuple):
-    """One text of the pages: where it stands, its context in the catalogue, and the English text."""
+    """One text of the pages: its place, its context in the catalogue, and the English text."""
 
     place: str
     context: str
@@ -59,7 +59,7 @@ def of_scripts() -> Iterator[Text]:
 
 
 def of_errors() -> Iterator[Text]:
-    """What happened and what to do, of each error that a module of the service raises; a value is ``{0}``, ``{1}``."""
+    """Return the cause and the next step of each error of a service module; values are ``{0}``, ``{1}``."""
     for path in (*sorted(SERVICE.rglob("*.py")), ROOT / "profiles" / "quantities.py"):
         if path.name in ELSEWHERE:
             continue
@@ -92,14 +92,14 @@ def _pattern(node: ast.AST) -> str | None:
 
 
 def of_code() -> Iterator[Text]:
-    """Texts that Python gives to a page."""
+    """Return the texts that Python passes to a page."""
     for path in (SERVICE / "page_routes.py",):
         for text in re.findall(r'language\.text\("([^"]+)"', path.read_text(encoding="utf-8")):
             yield Text(str(path.relative_to(ROOT)), "", text)
 
 
 def vocabulary() -> Iterator[Text]:
-    """Words that the API sends and a page shows: of the tables that declare them."""
+    """Return the words that the API sends and a page shows, from the tables that declare them."""
     from typing import get_args
 
     from drivers.drive import REACTIONS, Outcome

@@ -1,4 +1,4 @@
-"""A service on a folder of its own, whose runs are played by `fake_run`."""
+"""Service on its own folder, with runs of `fake_run`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ HANGS_S = 600.0
 
 
 def wait_for(what: str, happens: Callable[[], Any], within_s: float = HANGS_S) -> Any:
-    """It only bounds what would otherwise hang."""
+    """Wait for a condition with a time-out, which only prevents an endless wait."""
     end_s = time.monotonic() + within_s
     while not (found := happens()):
         assert time.monotonic() < end_s, f"never came: {what}"
@@ -47,7 +47,7 @@ def wait_for(what: str, happens: Callable[[], Any], within_s: float = HANGS_S) -
 
 
 class Service:
-    """One service without its web: the parts, and what it said on its terminal."""
+    """One service without its web server: its parts, and its output on the terminal."""
 
     def __init__(self, folder: Path, rigs: Path | None, fake: bool = True, login: bool = False) -> None:
         self.said: list[str] = []
@@ -75,8 +75,10 @@ _CWD = threading.Lock()
 
 
 def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch, *, played: bool = True) -> list[str]:
-    """The worker in this process. With `played` the identification of an upload is played; its note `fails` makes it
-    fail."""
+    """Run the worker in this process. With `played` the identification of an upload is simulated.
+
+    The note `fails` makes it fail.
+"""
     done: list[str] = []
 
     def found(what: str, run: str | None, asked: dict[str, Any]) -> dict[str, Any]:
@@ -103,14 +105,14 @@ def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch, *, played: b
 
 @pytest.fixture
 def nobody_s_port() -> Iterator[int]:
-    """One that nobody answers on and nobody else takes meanwhile: a drive's lock is one for all of this computer."""
+    """Return a reserved port without a server, since the lock of a drive is global on this computer."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         yield taken.getsockname()[1]
 
 
 def folder_of_locks(at: Path) -> str:
-    """Where anybody may make files, and nobody else does."""
+    """Return a folder for locks that other users may write to, and which no other test uses."""
     at.mkdir(exist_ok=True)
     at.chmod(0o1777)
     return str(at)
@@ -118,13 +120,13 @@ def folder_of_locks(at: Path) -> str:
 
 @pytest.fixture
 def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the service does as long as nobody on this computer holds a drive, it does whatever else is tested on it."""
+    """Use own locks, so that drives in use by other tests on this computer have no effect."""
     monkeypatch.setattr("tdhil.session.drive_lock.FOLDERS", (folder_of_locks(tmp_path / "locks"),))
 
 
 @pytest.fixture
 def rigs(tmp_path: Path, nobody_s_port: int, own_locks: None) -> Path:
-    """Two simulated ones, a real one that may be moved, one that may not, one that can't be read."""
+    """Return two simulated rigs, a real one that may move, one that may not, and one with an unreadable file."""
     folder = tmp_path / "rigs"
     folder.mkdir()
     for name in ("a", "b"):
@@ -143,14 +145,14 @@ def service(tmp_path: Path, rigs: Path) -> Iterator[Service]:
     found = Service(tmp_path / "data", rigs)
     yield found
     for run in found.supervisor.live():
-        (found.store.place(run) / "rest").touch()       # one that brakes (`fake_run`) would do so for ever
+        (found.store.place(run) / "rest").touch()       # a braking run (`fake_run`) would not end
         found.supervisor.stop(run, "end of the test")
     found.supervisor.close()
 
 
 @pytest.fixture(scope="session")
 def tls(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A certificate of its own for 127.0.0.1, and its key."""
+    """Return a certificate for 127.0.0.1 and its key."""
     if shutil.which("openssl") is None:
         pytest.skip("no openssl to make a certificate")
     folder = tmp_path_factory.mktemp("tls")
@@ -162,7 +164,7 @@ def tls(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 class Checked:
-    """A client that holds every answer of the API against the document."""
+    """Client that checks every reply of the API against the document."""
 
     def __init__(self, client: TestClient) -> None:
         self._client = client

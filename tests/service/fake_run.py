@@ -1,9 +1,9 @@
-"""A run's process without a drive: the same files, socket and lock, and what the request's note says happens.
+"""Process of a run without a drive: the same files, socket and lock, and the behaviour in the note of the request.
 
-``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, and is not seen at rest then) | ``brake`` (the
-same, and brakes until its folder has a file ``rest``) | ``ask`` (wants the code first; where its rig is watched, it
-then moves until it is stopped, or watched no more) | ``patient`` (the same, whose lease counts the time from when its
-page says that it goes: a test of it has all the time that it takes) | ``frozen`` (hears no stop) | ``identify`` (its
+``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, with an unconfirmed stop) | ``brake`` (the
+same, and brakes until its folder has a file ``rest``) | ``ask`` (needs the code first; if its rig is watched, it
+then moves until it is stopped or no longer watched) | ``patient`` (the same, but the time of the lease begins
+when its page closes, so that a test has no time limit) | ``frozen`` (receives no stop) | ``identify`` (its
 motion is over, and it computes until it is stopped) | ``die`` (killed while it moves)
 """
 

@@ -1,4 +1,4 @@
-"""String literals of a script, found without an engine: the tests look whether each text is translated."""
+"""String literals of a script, found without an engine, for the tests of translations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _Scanner:
         self.found.append((start, Literal(line, text, self._source[max(0, start - 60):start], template)))
 
     def code(self, at: int, inside: bool) -> int:
-        """Scan code to the brace that ends a value of a template, or to the end. Return the place behind it."""
+        """Scan code to the brace that ends a value of a template, or to the end. Return the position after it."""
         source, depth, last = self._source, 0, ""
         while at < len(source):
             sign = source[at]

@@ -1,4 +1,4 @@
-"""Who may what: every route of the served document for everybody; logins, tokens; what a stop doesn't wait for."""
+"""Access rights: every route of the served document for every role, logins, tokens, and a stop that never waits."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ from tests.service.conftest import Service, wait_for
 
 URL = "https://127.0.0.1:8420"
 PASSWORD = "correct horse battery"
-WRONG = {"note": 7, "model": 7, "name": 7, "code": 7, "old": 7, "password": 7}      # of no route's body
+WRONG = {"note": 7, "model": 7, "name": 7, "code": 7, "old": 7, "password": 7}      # not the body of any route
 STOPS = ("stop", "stop_rig")
 COOKIE = "__Host-tdhil-8420"
 
 
 @pytest.fixture(autouse=True)
 def cheap(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Passwords that cost nothing."""
+    """Make the hash of passwords cheap."""
     monkeypatch.setattr(accounts_module, "_N", 16)
     monkeypatch.setattr(accounts_module, "_P", 1)
 
 
 class Guarded:
-    """A service with somebody of each role, and a machine of each; one client, which asks as whom it is told to."""
+    """Service with a user and a token of each role, and one client that uses any of them."""
 
     def __init__(self, service: Service, client: TestClient) -> None:
         self.service, self.client, self.access = service, client, service.access
@@ -56,12 +56,12 @@ class Guarded:
         self.sessions = {role: self.log_in(role) for role in ROLES}
 
     def log_in(self, name: str) -> dict[str, str]:
-        """The headers of a page of his."""
+        """Return the headers of a page of this user."""
         cookie, who = self.access.log_in(name, PASSWORD, "192.0.2.1")
         return {"Cookie": f"{COOKIE}={cookie}", "X-CSRF-Token": who.csrf}
 
     def ended(self, name: str) -> dict[str, str]:
-        """Of one whose login has ended."""
+        """Return the headers of a user whose login has ended."""
         page, (last, session) = self.log_in(name), list(self.access._sessions.items())[-1]
         self.access._sessions[last] = replace(session, ends_s=self.time_s - 1.0)
         return page
@@ -106,9 +106,9 @@ def guarded(tmp_path: Path, rigs: Path, people: None) -> Iterator[Guarded]:
 
 @pytest.mark.heavy(each_share=True)
 def test_every_route_for_everybody(guarded, monkeypatch):
-    """Generated from the served document: who may, gets past the door; who may not, 401 or 403, and nothing happens.
+    """The cases are from the served document. Requests without the right get 401 or 403 and have no effect.
 
-    What is sent is no body of any route, so that nobody who gets past changes anything.
+    The body of the requests is invalid for every route, so that permitted requests change nothing either.
     """
     run = guarded.run()
     wait_for("its end", lambda: not guarded.service.supervisor.live())
@@ -138,7 +138,7 @@ def test_every_route_for_everybody(guarded, monkeypatch):
                         wrong.append((who, "page of", template, code))
                     continue
                 if name == "logout" and who.startswith("session"):
-                    continue               # it works, and would end the session of the next ones
+                    continue               # it works and would end the session for the next requests
                 code = guarded(method.upper(), path, headers, **sent).status_code
                 stops = name in STOPS and who == "a login that has ended"
                 past = code not in (401, 403)
@@ -151,8 +151,10 @@ def test_every_route_for_everybody(guarded, monkeypatch):
 
 
 def test_who_may_what_is_as_it_was_agreed(guarded):
-    """Written down here once more, since the document comes from the table that it is to judge: everybody who is known
-    sees and stops; what else somebody may, stands here."""
+    """The rights are stated here again, since the document is derived from the tested table.
+
+    Every user may read and stop. All other rights are listed here.
+    """
     least = {
         "operator": {"start", "confirm", "renew", "ask_replay", "calibration", "ask_fleet", "stop_fleet", "pace",
                      "check_rig", "annotate", "uploads", "upload", "one_upload", "preview", "identify_upload",
@@ -163,7 +165,7 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
                   "add_token", "remove_token"},
         "anybody": {"login", "logout", "me", "health", "openapi"},
     }
-    changes_nothing = {"plan", "password", *STOPS}         # of somebody else's
+    changes_nothing = {"plan", "password", *STOPS}         # of other users
     found: dict[str, str] = {}
     for methods in guarded.document["paths"].values():
         for method, described in methods.items():
@@ -174,7 +176,7 @@ def test_who_may_what_is_as_it_was_agreed(guarded):
     assert set().union(*least.values(), changes_nothing) <= found.keys()
 
 
-def test_a_machine_has_the_role_of_its_token_and_nobody_else_one(guarded):
+def test_only_a_token_gives_a_machine_its_role(guarded):
     for rank, role in enumerate(ROLES):
         assert guarded("GET", "/me", guarded.of_token(role)).json()["roles"] == list(ROLES[: rank + 1])
     for headers in ({"Authorization": "Bearer tdhil_x"}, {"Authorization": "Basic YTpi"}, {"Cookie": f"{COOKIE}=x"},
@@ -206,7 +208,7 @@ def test_a_page_has_no_form_that_its_reader_may_not_send(guarded, path, form):
 @pytest.mark.parametrize("there", [
     "//evil.example/", "https://evil.example", "/\\evil.example", "javascript:alert(1)", "", "/%0d%0aSet-Cookie",
     "/a b"])
-def test_a_login_leads_nowhere_else(guarded, there):
+def test_a_login_redirects_to_this_service_only(guarded, there):
     page = guarded.client.get("/login", params={"next": there}).text
     assert 'data-next="/"' in page or 'data-next="/%0d%0aSet-Cookie"' in page
     assert "evil" not in page
@@ -229,7 +231,7 @@ def test_a_login_and_its_end(guarded):
     on_disk = (guarded.service.store.folder / "sessions.json")
     assert given[COOKIE] not in on_disk.read_text()
     assert on_disk.stat().st_mode & 0o777 == 0o600
-    # Its port is another service's on this host.
+    # The port belongs to another service on this host.
     other = {"Host": "127.0.0.1:9000", "Cookie": page["Cookie"]}
     assert guarded("GET", "/me", other).json()["roles"] == []
     assert guarded("POST", "/logout", page, json={}).status_code == 200
@@ -239,7 +241,7 @@ def test_a_login_and_its_end(guarded):
              <= set(guarded.audit()))
 
 
-def test_a_login_holds_for_a_shift_and_over_a_restart_and_its_end_leaves_the_stop(guarded, tmp_path):
+def test_a_login_lasts_a_shift_and_a_restart_and_stop_works_after_its_end(guarded, tmp_path):
     run = guarded.run("hold")
     page = guarded.sessions["operator"]
     again = Access(tmp_path / "data", login=True, clock=lambda: guarded.time_s)
@@ -254,7 +256,7 @@ def test_a_login_holds_for_a_shift_and_over_a_restart_and_its_end_leaves_the_sto
 
 
 @pytest.mark.parametrize("headers", [{"X-CSRF-Token": ""}, {"X-CSRF-Token": "x" * 32}, {"X-CSRF-Token": b"\xe9"}])
-def test_what_comes_from_no_page_of_the_login_changes_nothing(guarded, headers):
+def test_a_request_without_the_token_of_the_login_changes_nothing(guarded, headers):
     page = {**guarded.sessions["operator"], **headers}
     for path in ("/rigs/a/runs", "/password", "/rigs/a/plan"):
         refused = guarded("POST", path, page, json={"note": "done"})
@@ -264,8 +266,8 @@ def test_what_comes_from_no_page_of_the_login_changes_nothing(guarded, headers):
     assert guarded.service.store.ids() == []
 
 
-def test_another_password_or_role_or_none_at_all_ends_what_was_open(guarded):
-    accounts = AccountsFile(guarded.service.store.folder)      # as the terminal would
+def test_a_change_or_removal_of_an_account_ends_its_sessions(guarded):
+    accounts = AccountsFile(guarded.service.store.folder)      # as the terminal does
     accounts.set_password("operator", "another horse battery")
     accounts.remove_user("viewer")
     accounts.remove_token("admin-machine")
@@ -283,7 +285,7 @@ def test_an_open_socket_ends_with_the_login(guarded, monkeypatch):
     address = f"{URL.replace('http', 'ws')}{API}/live/{guarded.run('hold')}"
     for headers in ({}, {"Cookie": f"{COOKIE}=x"}, {"Authorization": "Bearer x"}):
         assert closes(guarded, address, headers) == 4401
-    assert closes(guarded, f"{address}?token=x", guarded.sessions["viewer"]) == 4401        # nothing beside a token
+    assert closes(guarded, f"{address}?token=x", guarded.sessions["viewer"]) == 4401        # no cookie with a token
     from_elsewhere = {"Origin": "https://lichtblick.example"}
     assert closes(guarded, f"{address}?token=x", from_elsewhere) == 4401
     with pytest.raises(WebSocketDisconnect) as refused:
@@ -301,7 +303,7 @@ def test_an_open_socket_ends_with_the_login(guarded, monkeypatch):
 
 
 def closes(guarded: Guarded, path: str, headers: dict[str, str], protocols: list[str] | None = None) -> int | None:
-    """The code with which an accepted socket is closed at once; None where it says something first."""
+    """Return the code with which an accepted socket is closed at once, or None if it sends data first."""
     address = path if path.startswith("ws") else f"{URL.replace('http', 'ws')}{path}"
     with guarded.client.websocket_connect(address, headers=headers, subprotocols=protocols or None) as socket:
         message = socket.receive()
@@ -311,7 +313,7 @@ def closes(guarded: Guarded, path: str, headers: dict[str, str], protocols: list
 # -- how often a password may be tried
 
 
-def test_nobody_waits_longer_than_a_minute_and_nobody_is_kept_away_from_elsewhere():
+def test_a_login_waits_for_a_minute_at_most_and_other_addresses_are_not_locked_out():
     time_s = 0.0
     tries = Tries(lambda: time_s)
     tries.begin("anna", "home")
@@ -335,7 +337,7 @@ def test_nobody_waits_longer_than_a_minute_and_nobody_is_kept_away_from_elsewher
     tries.begin("anna", "elsewhere 0")
 
 
-def test_too_many_tries_are_refused_and_a_stop_is_not(guarded):
+def test_too_many_attempts_are_refused_but_a_stop_is_not(guarded):
     run = guarded.run("hold")
     for _ in range(Tries.OF_PAIR):
         answer = guarded("POST", "/login", json={"name": "operator", "password": "wrong"})
@@ -349,7 +351,7 @@ def test_too_many_tries_are_refused_and_a_stop_is_not(guarded):
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "2001:db8:0:1::5", "fe80::1%eth0", "::ffff:192.0.2.1"])
-def test_an_address_is_a_customer_s(host):
+def test_addresses_are_grouped_by_network(host):
     connection = HTTPConnection({"type": "http", "client": (host, 1), "headers": []})
     assert address_of(connection) in ("192.0.2.1", "2001:db8:0:1::/64", "fe80::/64")
 
@@ -405,11 +407,11 @@ def test_a_login_on_a_full_disk_holds_as_long_as_the_process(guarded, monkeypatc
     assert "end with this process" in guarded.service.said[-1]
 
 
-# -- two of them
+# -- two users
 
 
 @pytest.mark.heavy
-def test_two_who_ask_at_once_are_one_run(guarded):
+def test_two_simultaneous_requests_give_one_run(guarded):
     answers: list[Any] = []
     asking = [threading.Thread(target=lambda who=who: answers.append(guarded(
         "POST", "/rigs/a/runs", {**guarded.sessions[who], "Idempotency-Key": "one"}, json={"note": "hold"})))
@@ -424,14 +426,14 @@ def test_two_who_ask_at_once_are_one_run(guarded):
     assert sorted(one.status_code for one in answers) == [200] * 3 + [201] + [409] * 4
     assert {one.json()["asked_by"] for one in answers if one.status_code < 400} == {by}
     assert {one.json()["holder"] for one in answers if one.status_code == 409} == {f"run {run}"}
-    # Another one stops it, and it is his.
+    # Another user stops it, and the stop is attributed to that user.
     assert guarded("POST", "/rigs/a/stop", guarded.sessions["viewer"], json={}).status_code == 200
     guarded.service.wait(run, "stopped")
     assert guarded.service.store.status(run).stop.by == "viewer"
     wait_for("the audit", lambda: {(by, "asked", run), ("viewer", "stop asked", run)} <= set(guarded.audit()))
 
 
-def test_who_confirms_is_told_from_who_asked(guarded):
+def test_the_confirming_user_is_distinguished_from_the_requesting_one(guarded):
     run = guarded.run("ask", "real", "operator")
     said = f"Rig real. Requested by operator, run {run}."
     wait_for("the code", lambda: any(said in one for one in guarded.service.said))
@@ -443,7 +445,7 @@ def test_who_confirms_is_told_from_who_asked(guarded):
     wait_for("the audit", lambda: wanted <= set(guarded.audit()))
 
 
-def test_two_who_confirm_at_once_are_one_who_did(guarded):
+def test_two_simultaneous_confirmations_are_attributed_to_one_user(guarded):
     run, answers = guarded.run("ask", "real"), []
     confirming = [threading.Thread(target=lambda who=who: answers.append((who, guarded(
         "POST", f"/runs/{run}/confirm", guarded.sessions[who], json={"code": "123456"}).status_code)))
@@ -463,14 +465,14 @@ def test_two_who_confirm_at_once_are_one_who_did(guarded):
 
 @pytest.mark.parametrize("option", [
     {"accept_unverified": "likely"}, {"accept_wider_limit": ["torque"]}, {"--accept-speed-unit": True}])
-def test_what_nobody_verified_an_engineer_takes_upon_himself(guarded, option):
+def test_only_an_engineer_overrides_unverified_entries(guarded, option):
     refused = guarded("POST", "/rigs/a/runs", guarded.sessions["operator"], json=option)
     assert (refused.status_code, guarded.service.store.ids()) == (403, [])
     assert "not an engineer" in refused.json()["error"]["what"]
     assert guarded("POST", "/rigs/a/runs", guarded.sessions["engineer"], json=option).status_code == 201
 
 
-def test_nobody_takes_away_the_watchdog_over_http(guarded):
+def test_no_request_over_http_accepts_a_missing_watchdog(guarded):
     for option in ("accept_no_watchdog", "accept_shared_watchdog"):
         refused = guarded("POST", "/rigs/a/runs", guarded.sessions["admin"], json={option: True})
         assert "never accepted over HTTP" in refused.json()["error"]["what"]
@@ -493,7 +495,7 @@ def test_a_file_that_was_named_on_the_service_s_computer_stays_and_no_other_is_n
 
 
 @pytest.mark.heavy
-def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guarded, rigs, nobody_s_port):
+def test_an_engineer_edits_limits_of_a_rig_but_not_its_connection(guarded, rigs, nobody_s_port):
     engineer, path = guarded.sessions["engineer"], rigs / "real.yaml"
     before = path.read_text()
     path.chmod(0o640)
@@ -553,14 +555,14 @@ def test_a_rig_s_file_is_not_edited_without_a_login_nor_in_a_folder_that_is_read
 # -- without accounts, on loopback
 
 
-def test_at_this_computer_everybody_may_until_there_are_users(service):
+def test_on_this_computer_all_is_allowed_until_there_are_users(service):
     with TestClient(service.web.asgi, base_url="http://127.0.0.1:8420") as client:
         def code(method: str, path: str, **more: Any) -> int:
             return int(client.request(method, f"{API}{path}", **more).status_code)
 
         assert len(client.get(f"{API}/me").json()["roles"]) == len(ROLES)
         assert code("GET", "/audit") == 200
-        # Through a proxy it is somebody else; a token that isn't known is not "nobody asked".
+        # Through a proxy it is another client. An unknown token is not the same as no token.
         for headers in ({"X-Forwarded-For": "192.0.2.1"}, {"Forwarded": "for=x"}, {"Authorization": "Bearer x"}):
             assert code("GET", "/rigs", headers=headers) == 401
         assert code("POST", "/login", json={"name": "a", "password": "b"}) == 422
@@ -576,8 +578,8 @@ def test_at_this_computer_everybody_may_until_there_are_users(service):
 
 
 @pytest.mark.heavy
-def test_a_watched_rig_moves_for_who_is_known_alone(guarded):
-    """Without a login it is refused: tests/service/test_api.py."""
+def test_a_watched_rig_moves_only_for_a_logged_in_user(guarded):
+    """The refusal without a login is in tests/service/test_api.py."""
     for headers in (guarded.of_token("operator"), guarded.sessions["operator"]):
         answer = guarded("POST", "/rigs/watched/runs", headers, json={"note": "ask"})
         run = answer.json()["id"]
@@ -620,8 +622,8 @@ def test_an_admin_adds_and_removes_over_http(guarded):
 
 
 @pytest.mark.heavy
-def test_what_the_service_changes_itself_is_nobody_else_s_change(guarded, monkeypatch):
-    """Its own thread looks in the middle of it: whose change it was is told once, and rightly."""
+def test_a_change_by_the_service_is_attributed_correctly(guarded, monkeypatch):
+    """The thread of the service checks during the change. The user of the change is recorded once and correctly."""
     written = accounts_module.write_json
 
     def looked_at(*given: Any, **more: Any) -> None:
@@ -638,7 +640,7 @@ def test_what_the_service_changes_itself_is_nobody_else_s_change(guarded, monkey
     assert [who for who, what, _ in guarded.audit() if what == "token added"] == ["admin"]
 
 
-def test_what_is_kept_tells_nothing(tmp_path):
+def test_stored_data_contain_no_secrets(tmp_path):
     accounts = AccountsFile(tmp_path)
     accounts.add_user("anna", "operator", PASSWORD)
     accounts.add_user("bert", "operator", PASSWORD)
@@ -659,8 +661,8 @@ def test_what_is_kept_tells_nothing(tmp_path):
 
 
 @pytest.mark.heavy
-def test_a_password_costs_what_it_should(monkeypatch):
-    """32 MB and three passes, whatever the tests take here; as RFC 7914 has it for a salt and a cost of its own."""
+def test_the_hash_of_a_password_has_the_required_cost(monkeypatch):
+    """The product uses 32 MB and three passes. The result agrees with RFC 7914 for its salt and cost."""
     monkeypatch.undo()
     assert scrypt("x").startswith(f"scrypt${2**15}$8$3$")
     vector = "7023bdcb3afd7348461c06cd81fd38ebfda8fbba904f8e3ea9b543f6545da1f2"
@@ -669,7 +671,7 @@ def test_a_password_costs_what_it_should(monkeypatch):
 
 @pytest.mark.parametrize("name", [
     "", "A", "../x", "a/b", "<script>", "\x1b[31m", "a b", "local", "service", "terminal", "x" * 33, ".x", "a\n"])
-def test_a_name_is_a_plain_one(tmp_path, name):
+def test_names_have_plain_characters(tmp_path, name):
     accounts = AccountsFile(tmp_path)
     with pytest.raises(UsageError, match="must be 1 to 32"):
         accounts.add_user(name, "viewer", PASSWORD)
@@ -679,7 +681,7 @@ def test_a_name_is_a_plain_one(tmp_path, name):
 
 
 @pytest.mark.parametrize("password", ["", "short", "password123", "anna1234567", "aaaaaaaaaaaa", "x" * 201])
-def test_a_password_is_none_of_the_first_that_would_be_tried(tmp_path, password):
+def test_a_common_password_is_refused(tmp_path, password):
     with pytest.raises(UsageError, match="password"):
         AccountsFile(tmp_path).add_user("anna", "viewer", password)
 
@@ -690,7 +692,7 @@ def test_a_password_is_none_of_the_first_that_would_be_tried(tmp_path, password)
     '{"users": {"a": {"role": "admin", "password": "x", "since": "x"}}, "tokens": {}}',
     '{"users": {}, "tokens": {"a": {"role": "admin", "sha256": "", "since": "x"}}}',
 ])
-def test_accounts_that_make_no_sense_let_nobody_in_and_begin_no_service(tmp_path, text, capsys):
+def test_invalid_accounts_permit_no_login_and_no_start(tmp_path, text, capsys):
     (tmp_path / "accounts.json").write_text(text)
     with pytest.raises(UsageError, match="can't be read"):
         AccountsFile(tmp_path).read()
@@ -710,8 +712,8 @@ def test_a_name_that_is_tried_is_text_in_the_audit(guarded):
 # -- on the terminal
 
 
-def test_nothing_on_the_terminal_of_serve_is_obeyed_by_it(monkeypatch, capsys):
-    """Whatever says it: a rig's name, a drive's, an error's text."""
+def test_no_control_characters_reach_the_terminal_of_serve(monkeypatch, capsys):
+    """The text may be the name of a rig or a drive, or an error message."""
     monkeypatch.setattr("tdhil.service.serve", lambda rigs, data, host, port, say, **_: say("a\x1b[2Jb\x07\nc") or 0)
     assert main(["serve"]) == 0
     assert capsys.readouterr().err == "a␛[2Jb␇\nc\n"
@@ -746,8 +748,8 @@ def test_users_and_tokens_on_the_terminal(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_drive(guarded, monkeypatch):
-    """Decision 0022: a stop of a drive that no tdhil moves opens its bus."""
+def test_every_user_stops_runs_and_drives_that_tdhil_moves_and_an_operator_any_drive(guarded, monkeypatch):
+    """A stop of a drive that no tdhil process moves opens its bus (decision 0022)."""
     stopped: list[str] = []
     monkeypatch.setattr(guarded.service.supervisor, "stop_drive",
                         lambda rig, who: stopped.append(who) or (0, "tdhil stop confirmed standstill"))
@@ -768,14 +770,14 @@ def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_
     monkeypatch.setattr(guarded.service.supervisor, "blocked", lambda rig: "a run")
     assert {stop(headers).status_code for headers in viewers} == {200}
     monkeypatch.undo()
-    for rig in ("a", "broken"):                        # simulated; and one of which nothing can be known
+    for rig in ("a", "broken"):                        # a simulated one, and one with an unreadable file
         assert stop(viewers[0], rig).status_code == 200
     run = guarded.run("ask", rig="real")
     assert stop(viewers[0]).json()["runs"] == [run]
     guarded.service.wait(run, "stopped")
 
 
-def test_runs_are_named_to_who_is_known_alone(guarded):
+def test_runs_are_named_to_logged_in_users_only(guarded):
     run = guarded.run("hold")
     assert guarded("GET", "/healthz").json()["live"] == []
     assert guarded("GET", "/healthz", guarded.ended("admin")).json()["live"] == []
@@ -793,7 +795,7 @@ def test_codes_are_shown_ten_times_in_ten_minutes_and_forty_times_a_day():
             begun += 1
     assert begun == 10
     with pytest.raises(TooManyRuns) as refused:
-        pace.begin("anna", "192.0.2.2", "r")               # from elsewhere: it is the user's
+        pace.begin("anna", "192.0.2.2", "r")               # from another address: the limit is per user
     assert refused.value.wait_s == 600.0
     pace.begin("berta", "192.0.2.1", "r")
     for minute in range(23 * 60):
@@ -806,7 +808,7 @@ def test_codes_are_shown_ten_times_in_ten_minutes_and_forty_times_a_day():
     pace.begin("anna", "192.0.2.1", "r")
 
 
-def test_an_address_has_a_limit_of_its_own_and_what_was_refused_does_not_count():
+def test_an_address_has_its_own_limit_and_refused_requests_do_not_count():
     pace, begun = RequestPace(lambda: 0.0), 0
     for user in range(100):
         with contextlib.suppress(TooManyRuns):
@@ -841,7 +843,7 @@ def test_accounts_are_known_from_the_start_and_read_again_until_the_end(tmp_path
     accounts, told = AccountsFile(tmp_path), []
     accounts.add_user("anna", "operator", PASSWORD)
     access = Access(tmp_path, login=True, changed=lambda what, name: told.append((what, name)))
-    access.close()                             # one that was never begun
+    access.close()                             # a thread that was never started
     access = Access(tmp_path, login=True, changed=lambda what, name: told.append((what, name)))
     access.start()
     assert list(access.accounts.known.users) == ["anna"]
@@ -854,7 +856,7 @@ def test_accounts_are_known_from_the_start_and_read_again_until_the_end(tmp_path
     assert not access._thread.is_alive()
 
 
-def test_accounts_that_can_not_be_read_are_told_of_once_and_those_of_before_hold(tmp_path):
+def test_unreadable_accounts_are_reported_once_and_the_former_ones_are_used(tmp_path):
     accounts, said = AccountsFile(tmp_path), []
     accounts.path.write_text("{")
     access = Access(tmp_path, login=True, say=said.append)
@@ -867,7 +869,7 @@ def test_accounts_that_can_not_be_read_are_told_of_once_and_those_of_before_hold
     accounts.path.write_text("{")
     access.refresh()
     assert list(access.accounts.known.users) == ["anna"]
-    assert len(said) == 2                      # anew, since it was well in between
+    assert len(said) == 2                      # again, since it was readable in between
 
 
 def test_a_host_with_a_port_that_is_none_has_the_cookies_of_443():
@@ -875,10 +877,10 @@ def test_a_host_with_a_port_that_is_none_has_the_cookies_of_443():
     assert access_module._named("x", HTTPConnection(scope)) == "x-443"
 
 
-# -- what is remembered has an end
+# -- stored attempts and requests are limited
 
 
-def test_the_right_password_takes_the_wrong_tries_of_that_pair_back():
+def test_the_right_password_clears_the_wrong_attempts_of_that_pair():
     tries = Tries(lambda: 0.0)
     for _ in range(3):
         for _ in range(Tries.OF_PAIR - 1):
@@ -907,7 +909,7 @@ def test_runs_of_more_than_a_day_ago_do_not_count(monkeypatch):
     assert [len(times) for times in pace._begun.values()] == [1, 1]
 
 
-def test_a_login_is_a_good_try_and_has_an_end(tmp_path):
+def test_a_login_is_a_good_attempt_and_expires(tmp_path):
     AccountsFile(tmp_path).add_user("anna", "operator", PASSWORD)
     access = Access(tmp_path, login=True, clock=lambda: 1000.0)
     access.refresh(first=True)
@@ -917,7 +919,7 @@ def test_a_login_is_a_good_try_and_has_an_end(tmp_path):
     assert access.ends_s(access_module.LOCAL) is None
 
 
-def test_tries_of_long_ago_are_forgotten(monkeypatch):
+def test_old_attempts_are_removed(monkeypatch):
     time_s = 0.0
     tries = Tries(lambda: time_s)
     monkeypatch.setattr(Tries, "_MOST", 3)
@@ -929,19 +931,19 @@ def test_tries_of_long_ago_are_forgotten(monkeypatch):
     assert {key[1] for key in tries._tried} == {"anna", "192.0.2.77"}
 
 
-def test_who_asked_for_runs_long_ago_is_forgotten(monkeypatch):
+def test_old_requests_of_runs_are_removed(monkeypatch):
     time_s = 0.0
     pace = RequestPace(lambda: time_s)
     monkeypatch.setattr(RequestPace, "_MOST", 3)
     for number in range(6):
         pace.begin(f"user {number}", f"192.0.2.{number}", "a")
-    assert len(pace._begun) == 12              # all of them count yet
+    assert len(pace._begun) == 12              # all of them still count
     time_s = RequestPace.LIMITS[-1][0]
     pace.begin("anna", "192.0.2.77", "a")
     assert set(pace._begun) == {("user", "anna"), ("address", "192.0.2.77")}
 
 
-def test_the_oldest_login_makes_room_for_a_new_one(tmp_path, monkeypatch):
+def test_the_oldest_login_is_replaced_by_a_new_one(tmp_path, monkeypatch):
     AccountsFile(tmp_path).add_user("anna", "operator", PASSWORD)
     access = Access(tmp_path, login=True)
     access.refresh(first=True)

@@ -1,4 +1,4 @@
-"""The API over HTTP, with runs that are played: what it gives, refuses and does; each answer as the document says."""
+"""API over HTTP with runs of `fake_run`: replies, refusals and actions. Each reply agrees with the document."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from tdhil.service.schemas import ROUTES, SOCKETS, document
 from tdhil.session.task import machine_limits
 from tests.service.conftest import HANGS_S, URL, Service, wait_for
 
-# -- what there is
+# -- documents and addresses
 
 
 @pytest.mark.heavy
-def test_the_document_is_one(call):
+def test_the_document_agrees_with_the_routes(call):
     jsonschema.Draft202012Validator.check_schema({"$defs": call.document["components"]["schemas"]})
     assert call.document == document()
     names = [one["operationId"] for path in call.document["paths"].values() for one in path.values()]
@@ -56,7 +56,7 @@ THERE = (
 
 @pytest.mark.heavy(but_first=4)
 @pytest.mark.parametrize("route", THERE)
-def test_what_others_build_on_is_there_and_described(call, client, route):
+def test_the_public_routes_exist_and_are_described(call, client, route):
     method, _, path = route.partition(" ")
     described = call.document["paths"][f"{API}{path}"][method.lower()]
     assert described["x-role"]
@@ -71,7 +71,7 @@ def test_what_others_build_on_is_there_and_described(call, client, route):
     ("DELETE", f"{API}/rigs", {"GET", "HEAD", "POST"}), ("GET", f"{API}/rigs/a/runs", {"POST"}),
     ("POST", "/", {"GET", "HEAD"}), ("PUT", f"{API}/rigs/a/file", {"GET", "HEAD", "POST"}),
 ])
-def test_what_an_address_does_not_take_is_told_with_what_it_takes(client, method, path, allowed):
+def test_an_unsupported_method_is_refused_with_the_supported_ones(client, method, path, allowed):
     answer = client.request(method, path)
     assert (answer.status_code, set(answer.headers["allow"].split(", "))) == (405, allowed)
     told = answer.json()["error"]
@@ -79,13 +79,13 @@ def test_what_an_address_does_not_take_is_told_with_what_it_takes(client, method
     assert all(one in told["what"] for one in allowed)
 
 
-def test_an_address_at_which_nothing_is_says_so(client):
+def test_an_unknown_address_is_reported(client):
     told = client.get(f"{API}/nosuch").json()["error"]
     assert (told["where"], told["next_step"]) == (f"{API}/nosuch", f"See {API}/openapi.json")
     assert "/nosuch: this address does not exist" in client.get("/nosuch").text
 
 
-def test_rigs_say_what_they_are(call):
+def test_rigs_are_described(call):
     found = {one["id"]: one for one in call("GET", "/rigs", 200)}
     assert {name: one["state"] for name, one in found.items()} == {
         "a": "free", "b": "free", "real": "free", "never": "free", "watched": "free", "rehearsed": "free",
@@ -96,7 +96,7 @@ def test_rigs_say_what_they_are(call):
     assert call("GET", "/rigs/a", 200) == found["a"]
 
 
-def test_a_rig_whose_file_cannot_be_used_counts_as_real_and_says_why(service):
+def test_a_rig_with_an_unusable_file_counts_as_real_and_gives_the_reason(service):
     broken = service.supervisor.rigs.get("broken")
     with pytest.raises(UsageError, match=r"broken\.yaml:1"):
         broken.way()
@@ -132,7 +132,7 @@ def test_downloads_come_in_pieces(client, call, service):
         assert answer.status_code == status
         call.check("GET", f"{API}/runs/{run}/log.mcap", answer)
     call("GET", f"/runs/{run}/report.html", 404)
-    assert client.head(f"{API}/runs/{run}/result.json").status_code == 200             # looked at, and not downloaded
+    assert client.head(f"{API}/runs/{run}/result.json").status_code == 200             # displayed, not downloaded
     call("GET", f"/runs/{run}/log.mcap", 200)
     wait_for("the audit", lambda: sum(one.what == "downloaded run.mcap" for one in service.audit.entries()) == 5)
     assert not [one for one in service.audit.entries() if one.what == "downloaded result.json"]
@@ -149,14 +149,14 @@ def test_a_log_that_grows_comes_in_pieces_too(client, call, service):
     for headers in ({}, {"Range": "bytes=95-", "If-Range": '"of another size"'}):
         answer = client.get(f"{API}/runs/{run}/log.mcap", headers=headers)
         assert (answer.status_code, answer.content) == (200, b"0123456789" * 10)
-        assert "content-length" not in answer.headers          # it may have grown meanwhile
+        assert "content-length" not in answer.headers          # it may have grown in the meantime
 
 
 PLAN = {"excitation": "sine", "expected_half_width": None}
 
 
 def worked(service: Service, monkeypatch: pytest.MonkeyPatch, answer: Any) -> list[tuple[str, dict[str, Any]]]:
-    """Arithmetic is played: what was asked for."""
+    """Replace the computation; return its requests."""
     asked: list[tuple[str, dict[str, Any]]] = []
 
     def work(what: str, run: str | None, given: dict[str, Any]) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def worked(service: Service, monkeypatch: pytest.MonkeyPatch, answer: Any) -> li
     return asked
 
 
-def test_a_plan_is_asked_for_and_moves_nothing(call, service, monkeypatch):
+def test_a_plan_is_computed_without_motion(call, service, monkeypatch):
     asked = worked(service, monkeypatch, PLAN)
     assert call("POST", "/rigs/a/plan", 200, json={"tolerance": "1%"})["plan"] == PLAN
     assert [(what, given["options"]) for what, given in asked] == [("plan", {"tolerance": 0.01})]
@@ -178,7 +178,7 @@ def test_a_plan_is_asked_for_and_moves_nothing(call, service, monkeypatch):
     assert service.store.ids() == []
 
 
-def test_a_replay_stands_beside_the_first_result(call, service, monkeypatch):
+def test_a_replay_is_kept_beside_the_first_result(call, service, monkeypatch):
     run = call.start()["id"]
     service.wait(run, "done")
     first = call("GET", f"/runs/{run}", 200)["result"]
@@ -220,7 +220,7 @@ def test_no_plan_waits_for_a_replay(call, service, monkeypatch):
     assert asked == ["replay", "plan"]
 
 
-def test_a_replay_that_cannot_be_says_why_and_one_of_a_live_run_waits_for_its_end(call, service, monkeypatch):
+def test_an_impossible_replay_gives_the_reason_and_one_of_a_live_run_waits_for_its_end(call, service, monkeypatch):
     live = call.start("b", what="hold")["id"]
     service.wait(live, "moving")
     call("POST", f"/runs/{live}/replays", 422, json={})
@@ -251,12 +251,12 @@ def test_a_rig_s_results_over_time_and_runs_side_by_side(call, service, monkeypa
     assert call("GET", "/rigs/a/trend", 200)["trend"] == played
     compared = call("GET", f"/runs/compare?runs={','.join(runs)}", 200)
     assert compared["runs"] == runs
-    assert [one["date"] for one in compared["comparison"]["results"]] == times          # one time on all pages
+    assert [one["date"] for one in compared["comparison"]["results"]] == times          # the same time on all pages
     assert compared["comparison"]["settings"][0]["values"] == times
     rows = asked[0][1]["rows"]
     seconds = [[int(datetime.fromisoformat(at).timestamp()) for at in found]
                for found in ([one["date"] for one in rows], times[::-1])]
-    assert seconds[0] == seconds[1]                 # and in the trend's words as local time, with its zone
+    assert seconds[0] == seconds[1]                 # and local time with its zone in the sentences of the trend
     assert asked == [("trend", {"rows": rows, "rig": "a"}),
                      ("compare", {"runs": runs, "runs_folder": str(service.store.runs)})]
     for wrong in ("", runs[0], f"{runs[0]},{runs[0]}", ",".join("abcdefghi")):
@@ -264,11 +264,11 @@ def test_a_rig_s_results_over_time_and_runs_side_by_side(call, service, monkeypa
     call("GET", f"/runs/compare?runs={runs[0]},../../x", 404)
 
 
-def test_the_pdf_is_made_when_it_is_first_asked_for(call, service, monkeypatch):
+def test_the_pdf_is_made_on_the_first_request(call, service, monkeypatch):
     run = call.start()["id"]
     service.wait(run, "done")
     asked = worked(service, monkeypatch, {"file": "report.pdf"})
-    call("GET", f"/runs/{run}/report.pdf", 404)        # played: nothing came of it
+    call("GET", f"/runs/{run}/report.pdf", 404)        # no file is made in the test
     (service.store.place(run) / "report.pdf").write_bytes(b"%PDF")
     (service.store.place(run) / "report.html").write_bytes(b"<p>ours")
     assert call("GET", f"/runs/{run}/report.pdf", 200).content == b"%PDF"
@@ -287,7 +287,7 @@ def test_health_and_metrics(client, call, service):
     assert "tdhil_runs_asked_total 1.0" in call("GET", "/metrics", 200).text
 
 
-def test_rehearsals_are_counted_for_themselves_and_marked(client, call, service):
+def test_rehearsals_are_counted_separately_and_marked(client, call, service):
     (wrong,) = call("POST", "/rigs/a/runs", 422, json={"fault": ["torque-scale=abc"]})["fields"]
     assert wrong["option"] == "fault" and wrong["message"].startswith("'abc' is no value of torque-scale. It takes ")
     asked = {"note": "hold", "fault": ["sto@hold+2s"]}
@@ -300,8 +300,8 @@ def test_rehearsals_are_counted_for_themselves_and_marked(client, call, service)
     assert service.web.broker_messages()["rigs/a/state"]["run"]["rehearsal"] is True
 
 
-def test_a_wrong_fault_is_said_with_all_other_mistakes(call, service):
-    """It was said only once the others were corrected, and a plan did not say it at all."""
+def test_a_wrong_fault_is_reported_with_all_other_errors(call, service):
+    """It used to be reported only after correction of the others, and not at all for a plan."""
     asked = {"seed": "x", "fault": ["sto@nowhere", "sto@hold", "no-such-fault"], "max_time_s": -5.0,
              "expect": ["nonsense", "weight=1±1"]}
     for way in ("runs", "plan"):
@@ -313,17 +313,17 @@ def test_a_wrong_fault_is_said_with_all_other_mistakes(call, service):
     assert service.store.ids() == []
 
 
-# -- what one page reads
+# -- files and computations of one page
 
 
 def counted(monkeypatch, owner, name):
-    """Count the calls of a function, which goes on as before."""
+    """Count the calls of a function, without a change of its behaviour."""
     calls, real = [], getattr(owner, name)
     monkeypatch.setattr(owner, name, lambda *given, **named: (calls.append(given), real(*given, **named))[1])
     return calls
 
 
-def test_a_page_computes_the_way_to_a_rig_once_and_a_later_one_again(client, call, monkeypatch):
+def test_a_page_computes_the_connection_to_a_rig_once(client, call, monkeypatch):
     calls = counted(monkeypatch, start_request, "connection_of")
     for _ in range(2):
         calls.clear()
@@ -371,7 +371,7 @@ def test_the_page_of_the_audit_reads_the_chain_once(call, service, monkeypatch):
 # -- one run
 
 
-def test_a_run_is_stopped_and_says_when(call, service):
+def test_a_run_is_stopped_and_reports_the_times(call, service):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
     call("POST", f"/runs/{run}/stop", 200)
@@ -379,24 +379,24 @@ def test_a_run_is_stopped_and_says_when(call, service):
     found = call("GET", f"/runs/{run}", 200)
     assert found["stop"]["by"] == "local"
     assert found["stop"]["asked"] <= found["stop"]["seen"]
-    call("POST", f"/runs/{run}/stop", 200)         # once more does no harm
+    call("POST", f"/runs/{run}/stop", 200)         # a second stop has no effect
 
 
-def test_a_rig_is_stopped_whatever_its_run_is_called(call, service):
+def test_a_rig_is_stopped_without_the_id_of_its_run(call, service):
     run = call.start(what="hold")["id"]
     assert call("POST", "/rigs/a/stop", 200)["runs"] == [run]
     service.wait(run, "stopped")
     assert call("POST", "/rigs/b/stop", 200)["exit_code"] == 0
 
 
-def test_a_run_that_hears_no_socket_is_stopped_by_signal(call, service):
+def test_a_run_without_a_reply_on_its_socket_is_stopped_by_signal(call, service):
     run = call.start(what="deaf")["id"]
     service.wait(run, "moving")
     call("POST", f"/runs/{run}/stop", 200)
     service.wait(run, "stopped")
 
 
-def test_a_second_run_of_a_rig_is_refused_and_told_who_has_it(call, service):
+def test_a_second_run_of_a_rig_is_refused_with_the_owner(call, service):
     run = call.start(what="hold")["id"]
     refused = call.start(expect=409)
     assert refused["holder"] == f"run {run}"
@@ -405,7 +405,7 @@ def test_a_second_run_of_a_rig_is_refused_and_told_who_has_it(call, service):
     assert sorted(service.supervisor.live()) == sorted([run, other])
 
 
-def test_a_drive_that_a_terminal_has_is_refused_and_named(call, service):
+def test_a_drive_in_use_by_a_terminal_is_refused_and_named(call, service):
     from tdhil.session import hold
 
     address = service.supervisor.rigs.get("real").address
@@ -435,14 +435,14 @@ def test_the_same_key_gives_the_same_run(call, service):
     call.start(what="done", expect=409, headers=key)
     call("POST", f"/runs/{run}/stop", 200)
     service.wait(run, "stopped")
-    assert call.start(what="hold", expect=200, headers=key)["id"] == run       # also when it has ended
+    assert call.start(what="hold", expect=200, headers=key)["id"] == run       # even after its end
     assert len(service.store.ids()) == 1
 
 
 # -- the code
 
 
-def test_a_real_rig_moves_with_the_code_from_the_terminal_alone(call, service):
+def test_a_real_rig_moves_only_with_the_code_from_the_terminal(call, service):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")
     shown = wait_for("the code", lambda: next((one for one in service.said if "123 456" in one), None))
@@ -454,7 +454,7 @@ def test_a_real_rig_moves_with_the_code_from_the_terminal_alone(call, service):
     service.wait(run, "done")
     call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456"})          # once
 
-    def written() -> bool:        # the audit is written beside it: nothing that moves a shaft waits for a disk
+    def written() -> bool:        # the audit is written by another thread: no motion waits for a disk
         who = [(one["what"], one["run"]) for one in call("GET", "/audit", 200)["entries"]]
         return {("confirmed", run), ("confirmation refused", run)} <= set(who)
 
@@ -471,8 +471,8 @@ def test_another_plan_or_three_wrong_codes_void_it(call, service, sent):
     call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456", "binding": "b" * 64})
 
 
-def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(call, service):
-    assert "logged-in" in call.start("watched", expect=403)["error"]["what"]       # a real one, and nobody has
+def test_a_watched_run_moves_only_while_a_page_renews_its_lease(call, service):
+    assert "logged-in" in call.start("watched", expect=403)["error"]["what"]       # a real rig without a lease
     run = call.start("rehearsed", what="patient")["id"]
     service.wait(run, "awaiting_confirmation")
     key, later = "k" * 16, "n" * 16
@@ -488,11 +488,11 @@ def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(c
     assert "another page" in call("POST", f"/runs/{run}/lease", 409, json={"key": key})["error"]["what"]
     call("POST", f"/runs/{run}/lease", 422, json={"key": later, "gone": "bored"})
     assert call("POST", f"/runs/{run}/lease", 200, json={"key": later, "gone": "hidden"})["watch"]["how"] == "hidden"
-    service.wait(run, "stopped")                       # nobody renewed it
+    service.wait(run, "stopped")                       # the lease was not renewed
     watch = call("GET", f"/runs/{run}", 200)["watch"]
     assert watch["how"] == "hidden"
     assert watch["lost"] is not None
-    wait_for("its end", lambda: not lives(service.store.place(run)))      # until then it refuses by itself, 409
+    wait_for("its end", lambda: not lives(service.store.place(run)))      # until then it refuses with 409
     call("POST", f"/runs/{run}/lease", 503, json={"key": later})
 
 
@@ -502,7 +502,7 @@ def test_a_code_of_one_run_is_no_code_of_another(call, service):
     assert "nothing to confirm" in call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456"})["error"]["what"]
 
 
-# -- what may not be
+# -- refusals
 
 
 def test_a_rig_that_may_not_move_from_here(call):
@@ -531,7 +531,7 @@ def test_a_rig_that_may_not_move_from_here(call):
     ({"fault": {"a": 1}}, 422, "must be a text"),
     ({"seed": -1}, 422, "seed: must be at least 0"),
 ])
-def test_options_that_are_refused_begin_nothing(call, service, options, status, words):
+def test_refused_options_start_no_run(call, service, options, status, words):
     refused = call("POST", "/rigs/a/runs", status, json=options)["error"]
     assert words in refused["message"]
     assert service.store.ids() == []
@@ -541,7 +541,7 @@ def test_options_that_are_refused_begin_nothing(call, service, options, status, 
     (b"{", "is not JSON"), (b"[]", "must be an object"), (b'{"seed": NaN}', "not a number"), (b"\xff", "is not JSON"),
     (b"[" * 60000, "is not JSON"), (b"1" * 70000, "longer than the limit"),
 ])
-def test_what_is_no_request_is_refused(call, sent, words):
+def test_an_invalid_request_is_refused(call, sent, words):
     refused = call("POST", "/rigs/a/runs", 422, content=sent, headers={"content-type": "application/json"})
     assert words in refused["error"]["message"]
 
@@ -550,7 +550,7 @@ def test_a_form_of_another_site_is_no_request(call):
     call("POST", "/rigs/a/runs", 422, content=b"{}", headers={"content-type": "text/plain"})
 
 
-def test_units_are_taken_as_the_command_line_takes_them(call, service):
+def test_units_are_accepted_as_on_the_command_line(call, service):
     run = call("POST", "/rigs/a/runs", 201, json={"tolerance": "1%", "max-time": "5min", "--frequency": 0.2})
     assert run["options"] == {"tolerance": 0.01, "max_time_s": 300.0, "frequency_hz": 0.2}
 
@@ -560,13 +560,13 @@ def test_units_are_taken_as_the_command_line_takes_them(call, service):
     "/runs/20260101-000000-000000", "/runs/..%2f..%2fetc/log.mcap", "/runs/20260101-000000-000000/log.mcap",
     "/runs/20260101-000000-000000/replays/1",
 ])
-def test_what_is_not_there_is_not_there(client, path):
+def test_missing_objects_give_404(client, path):
     answer = client.get(f"{API}{path}")
     assert answer.status_code == 404
     assert answer.json()["error"]["exit_code"] == 2
 
 
-def test_nothing_but_its_own_files_is_served(client, service):
+def test_only_its_own_files_are_served(client, service):
     (service.store.folder / "secret").write_text("s3cret")
     for path in ("/static/../web.py", "/static/..%2fweb.py", "/static/%2e%2e/web.py", "/static//etc/passwd",
                  "/static/..%5cweb.py", "/runs/..%2fsecret", "/..%2fsecret"):
@@ -585,17 +585,17 @@ def test_a_browser_keeps_a_file_whose_address_has_the_hash_of_its_content(client
         answer = client.get(address)
         assert answer.headers["cache-control"] == "max-age=31536000, immutable", address
         assert hashlib.sha256(answer.content).hexdigest()[:16] == digest
-        for other in (path, f"{path}?{digest[::-1]}"):             # a page of another version: never kept
+        for other in (path, f"{path}?{digest[::-1]}"):             # a page of another version: never cached
             assert client.get(other).headers["cache-control"] == "no-store"
     for path in ("/", "/runs", f"{API}/rigs"):
         assert client.get(path).headers["cache-control"] == "no-store"
 
 
-# -- whence
+# -- origin of requests
 
 
 @pytest.mark.parametrize("headers", [{"Origin": URL}, {}])
-def test_a_socket_from_its_own_page_gets_as_far_as_the_run(client, headers):
+def test_a_socket_from_its_own_page_is_accepted(client, headers):
     address = f"{URL.replace('http', 'ws')}{API}/live/20260101-000000-000000"
     with pytest.raises(WebSocketDenialResponse) as denied, client.websocket_connect(address, headers=headers):
         pass
@@ -604,7 +604,7 @@ def test_a_socket_from_its_own_page_gets_as_far_as_the_run(client, headers):
 
 @pytest.mark.parametrize("host", [
     "evil.example", "evil.example:8420", "127.0.0.1.evil.example", "[::2]", "192.0.2.7", ""])
-def test_by_another_name_it_is_not_reached(client, host):
+def test_it_is_not_reached_by_another_host_name(client, host):
     for path in ("/", f"{API}/rigs", "/static/app.js"):
         assert client.get(path, headers={"Host": host}).status_code == 403
     with pytest.raises(Exception), client.websocket_connect(f"{API}/live/x", headers={"Host": host}):  # noqa: B017
@@ -612,7 +612,7 @@ def test_by_another_name_it_is_not_reached(client, host):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost:8420", "LOCALHOST", "[::1]:8420"])
-def test_by_its_own_names_it_is(client, host):
+def test_it_is_reached_by_its_own_host_names(client, host):
     assert client.get(f"{API}/rigs", headers={"Host": host}).status_code == 200
 
 
@@ -628,7 +628,7 @@ def test_a_page_of_another_site_moves_and_stops_nothing(client, service, headers
         pass
 
 
-def test_every_answer_says_what_a_page_may_do(client):
+def test_every_reply_has_a_content_security_policy(client):
     for path in ("/", f"{API}/rigs", "/static/app.js", "/nothing", f"{API}/nothing"):
         headers = client.get(path).headers
         assert "default-src 'none'" in headers["content-security-policy"], path
@@ -636,11 +636,11 @@ def test_every_answer_says_what_a_page_may_do(client):
         assert "access-control-allow-origin" not in headers
 
 
-# -- what dies
+# -- lost processes
 
 
 @pytest.mark.heavy
-def test_a_run_whose_process_is_killed_is_told_of_and_its_drive_stopped(call, service):
+def test_a_killed_run_is_reported_and_its_drive_stopped(call, service):
     run = call.start(what="die")["id"]
     service.wait(run, "interrupted")
     found = call("GET", f"/runs/{run}", 200)
@@ -650,7 +650,7 @@ def test_a_run_whose_process_is_killed_is_told_of_and_its_drive_stopped(call, se
 
 
 @pytest.mark.heavy
-def test_so_it_is_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
+def test_a_killed_run_is_reported_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
     save, room = service.store.save, threading.Event()
 
     def full(status):
@@ -663,14 +663,14 @@ def test_so_it_is_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
     monkeypatch.setattr(service.store, "save", full)
     os.kill(service.store.status(run).pid, signal.SIGKILL)
     wait_for("that it is told", lambda: any("can't be written yet" in one for one in service.said))
-    assert call("GET", "/rigs/a", 200)["state"] == "busy"          # nobody takes it meanwhile
+    assert call("GET", "/rigs/a", 200)["state"] == "busy"          # reserved in the meantime
     room.set()
     service.wait(run, "interrupted")
     wait_for("its end", lambda: not service.supervisor.live())
 
 
 @pytest.mark.heavy
-def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(call, service):
+def test_an_unreachable_real_drive_blocks_its_rig_until_the_sign_off(call, service):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")
     os.kill(service.store.status(run).pid, signal.SIGKILL)
@@ -692,7 +692,7 @@ def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(c
 def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
-    service.supervisor.close()                         # as dead as it gets: it looks no more
+    service.supervisor.close()                         # as if dead: it checks no more
     after = Service(tmp_path / "data", rigs)
     with TestClient(after.web.asgi, base_url=URL) as client:
         assert client.get(f"{API}/runs/{run}").json()["state"] == "moving"
@@ -704,7 +704,7 @@ def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
 
 
 @pytest.mark.heavy
-def test_a_service_that_ends_begins_nothing_and_waits_for_rest(call, service):
+def test_a_service_that_ends_starts_no_run_and_waits_for_standstill(call, service):
     run, loose = call.start(what="hold")["id"], call.start("b", what="loose")["id"]
     for one in (run, loose):
         service.wait(one, "moving")
@@ -716,7 +716,7 @@ def test_a_service_that_ends_begins_nothing_and_waits_for_rest(call, service):
     assert "is ending" in call.start("b", expect=409)["error"]["what"]
 
 
-def test_a_stop_of_a_run_that_has_ended_leaves_it_as_it_is(call, service):
+def test_a_stop_of_an_ended_run_does_not_change_it(call, service):
     run = call.start()["id"]
     service.wait(run, "done")
     wait_for("its end", lambda: not service.supervisor.live())
@@ -739,7 +739,7 @@ def test_nothing_moves_by_a_restart(call, service, tmp_path, rigs):
 
 
 @pytest.mark.heavy
-def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypatch):
+def test_a_locked_index_and_a_full_audit_delay_no_stop(call, service, monkeypatch):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
     wait_for("the index", lambda: call("GET", "/runs", 200))
@@ -754,10 +754,10 @@ def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypa
         service.wait(run, "stopped")
         assert service.web.find_runs(RunFilter())[0].id == run      # from the files
     base.close()
-    wait_for("the index", lambda: service.index.find(state="stopped"))     # it is tried again
+    wait_for("the index", lambda: service.index.find(state="stopped"))     # another attempt follows
 
 
-def test_the_list_says_what_a_run_is_now(call, service):
+def test_the_list_shows_the_present_state_of_a_run(call, service):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
     assert [(one["id"], one["state"]) for one in call("GET", "/runs", 200)] == [(run, "moving")]
@@ -767,7 +767,7 @@ def test_the_list_says_what_a_run_is_now(call, service):
 
 
 @pytest.mark.heavy
-def test_what_a_killed_web_left_out_of_the_index_is_in_it_again(call, service, tmp_path, rigs):
+def test_runs_missing_in_the_index_of_a_killed_web_are_added(call, service, tmp_path, rigs):
     run = call.start()["id"]
     service.wait(run, "done")
     wait_for("the index", lambda: service.index.find(state="done"))
@@ -781,7 +781,7 @@ def test_what_a_killed_web_left_out_of_the_index_is_in_it_again(call, service, t
     after.supervisor.close()
 
 
-def test_the_audit_says_who_did_what_and_that_it_holds(call, service):
+def test_the_audit_shows_users_and_actions_and_is_intact(call, service):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
     call("POST", f"/runs/{run}/stop", 200)
@@ -795,13 +795,13 @@ def test_the_audit_says_who_did_what_and_that_it_holds(call, service):
     assert call("GET", "/audit", 200)["broken"]["line"] >= 1
 
 
-def test_a_web_without_descriptors_answers_in_words_and_writes_one_line_a_second(client, service, monkeypatch, capsys):
+def test_a_web_without_descriptors_replies_with_a_message_and_limits_its_lines(client, service, monkeypatch, capsys):
     def none_left(*_: Any) -> Any:
         raise OSError(errno.EMFILE, "Too many open files")
 
     service.said.clear()
     monkeypatch.setattr(service.web, "rig_view", none_left)
-    answers = [client.get(f"{API}/rigs") for _ in range(20)]       # and nothing is raised, which the server would log
+    answers = [client.get(f"{API}/rigs") for _ in range(20)]       # without an exception, which the server would log
     assert {one.status_code for one in answers} == {503}
     assert "no descriptor left" in answers[0].json()["error"]["what"]
     assert len([one for one in service.said if "no descriptor left" in one]) <= 2
@@ -813,7 +813,7 @@ def test_a_web_without_descriptors_answers_in_words_and_writes_one_line_a_second
     (errno.EROFS, 503, "Check that folder"),
 ])
 @pytest.mark.parametrize("at", ["new_id", "begin", "save"])
-def test_a_run_that_cannot_be_written_down_is_refused_in_words(call, service, monkeypatch, number, status, words, at):
+def test_a_run_that_cannot_be_recorded_is_refused_with_a_message(call, service, monkeypatch, number, status, words, at):
     def full(*_: Any) -> Any:
         raise OSError(number, os.strerror(number))
 
@@ -826,7 +826,7 @@ def test_a_run_that_cannot_be_written_down_is_refused_in_words(call, service, mo
     assert call("GET", "/rigs/a", 200)["state"] == "free"
 
 
-def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(call, service, monkeypatch):
+def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_with_a_message(call, service, monkeypatch):
     def full(*_: Any) -> Any:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""The page /docs: every route and object of the OpenAPI document, from this host alone."""
+"""Page /docs: every route and object of the OpenAPI document, without other hosts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is there while a run goes: the code and what voids it, the board, and what a page is told of a stop."""
+"""Attendance of a run: the code and its end, the board, and the data of a stop for a page."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def board(tmp_path) -> Board:
     found = Board(store, Status.begun(run, "rig", now()))
     yield found
     found.close()
-    assert store.status(run) == found.status           # all of it was written
+    assert store.status(run) == found.status           # everything was written
 
 
 class Clock:
@@ -88,7 +88,7 @@ def test_after_a_minute_it_is_void():
         confirming.look()
 
 
-def test_so_it_is_for_another_plan_a_changed_file_and_after_three_tries():
+def test_a_code_is_void_for_another_plan_a_changed_file_and_after_three_attempts():
     def changed() -> None:
         raise PreflightRefused("the rig's file was changed")
 
@@ -109,7 +109,7 @@ def operator_interface(board: Board, tmp_path, confirming: Confirming, **more) -
     return ServiceOperator(board, Watcher(board), tmp_path, lambda found: confirming, **more)
 
 
-def test_a_real_shaft_waits_for_the_code_and_is_fed_meanwhile(board, tmp_path):
+def test_a_real_drive_waits_for_the_code_and_is_fed_in_the_meantime(board, tmp_path):
     confirming = Confirming("b" * 64, lambda: None)
     there, cycles = operator_interface(board, tmp_path, confirming), []
     board.to(State.PREFLIGHT)
@@ -125,7 +125,7 @@ def test_a_real_shaft_waits_for_the_code_and_is_fed_meanwhile(board, tmp_path):
     wait_for("confirm.json", (tmp_path / "confirm.json").exists)
 
 
-def test_nobody_confirms_and_nothing_moves(board, tmp_path):
+def test_without_a_confirmation_there_is_no_motion(board, tmp_path):
     clock = Clock()
     there = operator_interface(board, tmp_path, Confirming("b" * 64, lambda: None, clock=clock))
     board.to(State.PREFLIGHT)
@@ -138,7 +138,7 @@ def test_nobody_confirms_and_nothing_moves(board, tmp_path):
     assert board.status.state is State.AWAITING
 
 
-def test_what_is_raised_while_waiting_goes_out(board, tmp_path):
+def test_an_exception_during_the_wait_is_raised(board, tmp_path):
     there = operator_interface(board, tmp_path, Confirming("b" * 64, lambda: None))
     board.to(State.PREFLIGHT)
 
@@ -149,7 +149,7 @@ def test_what_is_raised_while_waiting_goes_out(board, tmp_path):
         there.confirm(TASK, preflight(simulated=False), idle, ())
 
 
-def test_a_simulated_shaft_asks_nobody(board, tmp_path):
+def test_a_simulated_shaft_needs_no_confirmation(board, tmp_path):
     there = operator_interface(board, tmp_path, Confirming("b" * 64, lambda: None))
     board.to(State.PREFLIGHT)
     there.confirm(TASK, preflight(simulated=True), pytest.fail, ())
@@ -157,7 +157,7 @@ def test_a_simulated_shaft_asks_nobody(board, tmp_path):
     assert there.confirming is None
 
 
-def test_a_speed_that_somebody_would_have_to_see_is_refused(board, tmp_path):
+def test_a_speed_that_an_operator_would_have_to_confirm_is_refused(board, tmp_path):
     there = operator_interface(board, tmp_path, Confirming("b" * 64, lambda: None))
     with pytest.raises(PreflightRefused, match="no operator can confirm"):
         there.confirm_speed(1.0, "no angle", pytest.fail)
@@ -170,7 +170,7 @@ KEY = "k" * 16
 
 
 class Watched:
-    """A lease on a clock that is set, and what it told."""
+    """Lease with an adjustable clock, and its messages."""
 
     def __init__(self) -> None:
         self.clock, self.told, self.lost, self.needed = Clock(), [], [], True
@@ -200,32 +200,32 @@ def test_a_lease_holds_as_long_as_it_is_renewed_and_is_lost_for_good_5_s_after()
     assert len(watched.lost) == 1
 
 
-def test_a_renewal_that_comes_too_late_is_none_even_where_nobody_looked_at_the_clock():
+def test_a_late_renewal_does_not_count_even_without_a_check_in_between():
     watched = Watched()
     with pytest.raises(PreflightRefused, match="can't be renewed"):
         watched.at(LEASE_S + 0.01).renew(KEY, "who")
     assert len(watched.lost) == 1
 
 
-def test_a_page_that_goes_is_named_and_may_come_back_in_time():
+def test_a_closing_page_is_reported_and_may_return_in_time():
     watched = Watched()
     watched.at(1.0).renew(KEY, "who", gone="hidden")
     watched.at(2.5).look()
     watched.at(3.0).renew(KEY, "who")
     watched.at(3.0 + SILENT_S).look()
     watched.at(5.5).renew(KEY, "who", gone="closed")
-    watched.at(5.5).renew(KEY, "who", gone="hidden")   # as closing has it, in either order
-    watched.at(3.0 + LEASE_S).look()                   # what a page says when it goes renews nothing
+    watched.at(5.5).renew(KEY, "who", gone="hidden")   # as at closing, in each order
+    watched.at(3.0 + LEASE_S).look()                   # the message of a closing page does not renew the lease
     assert [(one.how, one.lost is not None) for one in watched.told] == [
         (None, False), ("hidden", False), (None, False), ("silent", False), ("closed", False), ("closed", True)]
 
 
-def test_a_page_that_is_loaded_anew_takes_the_lease_with_it():
+def test_a_reloaded_page_keeps_the_lease():
     watched = Watched()
     watched.lease.renew(KEY, "who", new_key="n" * 16)
-    watched.lease.renew(KEY, "who", new_key="n" * 16)  # its answer was lost
+    watched.lease.renew(KEY, "who", new_key="n" * 16)  # its reply was lost
     with pytest.raises(PreflightRefused, match="another page"):
-        watched.lease.renew(KEY, "who")                # the page before, or a copy of it
+        watched.lease.renew(KEY, "who")                # the former page, or a copy of it
     with pytest.raises(PreflightRefused, match="another page"):
         watched.lease.renew("n" * 16, "somebody else")
     with pytest.raises(PreflightRefused, match="another page"):
@@ -234,7 +234,7 @@ def test_a_page_that_is_loaded_anew_takes_the_lease_with_it():
     assert watched.lost == []
 
 
-def test_where_nothing_moves_any_more_nothing_is_lost():
+def test_after_the_motion_no_lease_is_lost():
     watched = Watched()
     watched.needed = False
     watched.at(100.0).look()
@@ -242,7 +242,7 @@ def test_where_nothing_moves_any_more_nothing_is_lost():
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-def test_a_watched_shaft_waits_for_a_page_that_stays_and_brakes_without(board, tmp_path, simulated):
+def test_a_watched_shaft_waits_for_a_page_and_brakes_without_one(board, tmp_path, simulated):
     confirming = Confirming("b" * 64, lambda: None, watched=True)
     lost = []
     there = operator_interface(board, tmp_path, confirming, watched=True, unwatched=lost.append)
@@ -257,13 +257,13 @@ def test_a_watched_shaft_waits_for_a_page_that_stays_and_brakes_without(board, t
     there.confirm(TASK, preflight(simulated=simulated), idle, ())
     assert board.status.state is State.MOVING
     assert board.status.watch.by == "who"
-    there.lease._clock = lambda: 1e9                   # its own thread sees it
+    there.lease._clock = lambda: 1e9                   # its own thread detects it
     wait_for("the end of the lease", lambda: lost)
     wait_for("the status", lambda: board.status.watch.lost)
     there.lease.end()
 
 
-def test_the_log_is_told_of_it_by_the_control_loop_alone(board):
+def test_only_the_control_loop_writes_it_to_the_log(board):
     watcher, told = Watcher(board), []
     watcher.log = SimpleNamespace(event=lambda *said: told.append(said))
     watcher.remark("its page is hidden")
@@ -273,10 +273,10 @@ def test_the_log_is_told_of_it_by_the_control_loop_alone(board):
     assert told == [(SAMPLE.time_s, "watch", "its page is hidden")]
 
 
-# -- the board and what it is told
+# -- the board and its data
 
 
-def test_a_stop_by_a_signal_is_told_of_too_and_one_by_the_socket_by_who_asked(board):
+def test_a_stop_by_a_signal_is_reported_too_and_one_by_the_socket_by_its_sender(board):
     stop = StopRequest()
     watcher = Watcher(board, stop)
     stop.ask(15)
@@ -288,17 +288,17 @@ def test_a_stop_by_a_signal_is_told_of_too_and_one_by_the_socket_by_who_asked(bo
     board.know(stop=type(board.status.stop)())
     other.ask(15, "somebody asked")
     watcher.cycle(COMMAND, SAMPLE)
-    assert board.status.stop.asked is None             # whoever asked notes it himself
+    assert board.status.stop.asked is None             # the requesting side records it
     with pytest.raises(Interrupted, match="interrupted: somebody asked"):
         other.check()
 
 
-def test_stages_go_by_and_a_stop_has_its_times(board):
+def test_stages_are_shown_and_a_stop_has_its_times(board):
     watcher = Watcher(board)
     watcher.preflight(preflight(simulated=True))
     board.to(State.PREFLIGHT)
     watcher.stage_started("setup", 10.0)
-    assert board.status.state is State.PREFLIGHT            # the drive is only looked at
+    assert board.status.state is State.PREFLIGHT            # the drive is only read
     board.to(State.MOVING, "setup")
     watcher.stage_started("speed", 40.0)
     assert (board.status.stage, board.status.expected_s["speed"]) == ("speed", 40.0)
@@ -318,12 +318,12 @@ def test_stages_go_by_and_a_stop_has_its_times(board):
     assert board.status.stop.at_rest is not None
 
 
-def test_the_plan_says_how_long_its_stage_takes(board):
+def test_the_plan_states_the_duration_of_its_stage(board):
     Watcher(board).planned(SimpleNamespace(duration_s=100.0))
     assert board.status.expected_s["acquire"] == 105.0
 
 
-def test_what_a_drive_says_of_itself_is_text(board):
+def test_data_of_a_drive_are_text(board):
     Watcher(board).preflight(preflight(simulated=True))
     assert "\x1b" not in board.status.identity + board.status.preflight[0].found
     assert "<drive>" in board.status.identity              # the page escapes it
@@ -334,7 +334,7 @@ def test_a_step_that_cannot_be_ends_no_run(board):
     assert board.status.state is State.REQUESTED
 
 
-def test_a_line_for_a_log_that_takes_none_is_nobody_s_error(monkeypatch):
+def test_a_line_for_a_log_that_accepts_none_is_no_error(monkeypatch):
     full = Path("/dev/full").open("w")                     # noqa: SIM115
     monkeypatch.setattr("sys.stderr", full)
     print_line("no space for this")
@@ -343,7 +343,7 @@ def test_a_line_for_a_log_that_takes_none_is_nobody_s_error(monkeypatch):
         full.close()
 
 
-def test_a_full_disk_holds_nobody_up(board, monkeypatch):
+def test_a_full_disk_delays_nothing(board, monkeypatch):
     def full(status: Status) -> None:
         raise OSError(28, "No space left on device")
 
@@ -354,7 +354,7 @@ def test_a_full_disk_holds_nobody_up(board, monkeypatch):
     assert board.status == replace(board.status, pid=7)
 
 
-def test_a_second_stop_leaves_the_time_when_the_first_was_seen(board, monkeypatch):
+def test_a_second_stop_keeps_the_time_of_the_first(board, monkeypatch):
     times = iter(f"2026-01-01T00:00:{number:02d}.000Z" for number in range(60))
     monkeypatch.setattr("tdhil.service.attendance.now", lambda: next(times))
     watcher = Watcher(board)

@@ -1,4 +1,4 @@
-"""A drive without the simulator's marker, in another process: it moves with the code that stood on the terminal."""
+"""Drive without the simulator's marker, in another process: it moves with the code from the terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def rig_of(drive: Peer) -> str:
 
 
 @pytest.mark.parametrize("changed", ["profile.yaml", "rig.yaml"])
-def test_a_code_is_void_once_the_rig_s_file_or_its_profile_is_another(tmp_path, changed):
+def test_a_code_is_void_once_the_rig_s_file_or_its_profile_changes(tmp_path, changed):
     from profiles.library import profile_path
 
     for name, text in (
@@ -78,7 +78,7 @@ def test_a_real_drive_moves_with_its_code_and_no_other(tmp_path):
         service.wait(second, "awaiting_confirmation")
         asked = f"run {second}. To let it move"
         shown = wait_for("the code", lambda: next((one for one in service.said if asked in one), None))
-        with pytest.raises(Conflict, match="the code is wrong"):      # of the run before
+        with pytest.raises(Conflict, match="the code is wrong"):      # from the run before
             supervisor.confirm(second, code.replace(" ", "") if code not in shown else "000000", None, "local")
         (code,) = re.findall(r"(\d{3} \d{3})\n", shown)
         status = service.store.status(second)

@@ -1,4 +1,4 @@
-"""What is given to who installs it: the unit, the container, the upgrade that is refused while something moves."""
+"""Installation: systemd unit, container, and an upgrade that is refused while a shaft moves."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DEPLOY = ROOT / "deploy"
 
 @pytest.fixture(autouse=True)
 def locks(tmp_path, monkeypatch):
-    """A folder of its own: others may be at work on this computer."""
+    """Use an own folder for locks, since other tests may use this computer."""
     folder = tmp_path / "lock"
     folder.mkdir()
     folder.chmod(0o1777)
@@ -43,10 +43,10 @@ def idle(data: Path) -> int:
     return main(["serve", "--check-idle", "--data", str(data)])
 
 
-def test_a_run_that_lives_is_in_the_way_of_an_upgrade_with_or_without_its_web(service, capsys):
+def test_a_live_run_prevents_an_upgrade_with_or_without_its_web(service, capsys):
     assert idle(service.store.folder) == ExitCode.OK
     run = service.supervisor.start_run("a", {"note": "hold"}, "test").request.id
-    assert idle(service.store.folder) == ExitCode.REFUSED                  # as soon as it was asked for
+    assert idle(service.store.folder) == ExitCode.REFUSED                  # from its request on
     assert f"run {run} has not ended" in capsys.readouterr().err
     service.wait(run, "moving")
     service.supervisor.close()
@@ -55,7 +55,7 @@ def test_a_run_that_lives_is_in_the_way_of_an_upgrade_with_or_without_its_web(se
     wait_for("the end", lambda: idle(service.store.folder) == ExitCode.OK)
 
 
-def test_so_is_a_shaft_that_nobody_saw_at_rest_until_somebody_signs(service, capsys):
+def test_an_unconfirmed_stop_prevents_an_upgrade_until_the_sign_off(service, capsys):
     run = service.supervisor.start_run("a", {"note": "unseen"}, "test").request.id
     service.wait(run, "stop_not_confirmed")
     wait_for("its end", lambda: not lives(service.store.place(run)))
@@ -65,20 +65,20 @@ def test_so_is_a_shaft_that_nobody_saw_at_rest_until_somebody_signs(service, cap
     assert idle(service.store.folder) == ExitCode.OK
 
 
-def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys, nobody_s_port):
+def test_a_drive_in_use_by_a_terminal_prevents_an_upgrade(tmp_path, capsys, nobody_s_port):
     assert holders() == []
     one, other = (f"modbus 127.0.0.1:{nobody_s_port} unit {unit}" for unit in (1, 2))
     with hold(one), hold(other):
         assert sorted(map(str, holders())) == sorted(str(holder_of(address)) for address in (one, other))
         assert idle(tmp_path / "none") == ExitCode.REFUSED
         assert f"a drive is held by process {os.getpid()}" in capsys.readouterr().err
-    assert idle(tmp_path / "none") == ExitCode.USAGE       # who misspelt it has asked nothing
+    assert idle(tmp_path / "none") == ExitCode.USAGE       # a misspelt command gives no answer
     assert not (tmp_path / "none").exists()
 
 
 @pytest.fixture
 def host(tmp_path):
-    """An installation whose commands only note down that they were called; tdhil answers what ``codes`` says."""
+    """Return an installation whose commands only record their calls; tdhil returns the ``codes``."""
     home, called = tmp_path / "home", tmp_path / "called.txt"
     (home / "bin").mkdir(parents=True)
 
@@ -126,11 +126,11 @@ def settings() -> dict[str, list[str]]:
 
 def test_the_unit_stops_as_the_service_does():
     unit = settings()
-    assert unit["KillMode"] == ["process"]                 # runs outlive their web, and brake in peace
+    assert unit["KillMode"] == ["process"]                 # runs outlive their web server, and brake normally
     assert unit["KillSignal"] == ["SIGTERM"]
     assert float(unit["TimeoutStopSec"][0]) > STOP_S + 10.0
     assert "ExecStop" not in unit
-    assert "ExecStartPre" not in unit                      # whatever moves, a web that died comes back
+    assert "ExecStartPre" not in unit                      # a web server that died is restarted, even during motion
     assert unit["RestartPreventExitStatus"] == [str(int(ExitCode.USAGE))]
 
 
@@ -148,7 +148,7 @@ def test_the_unit_allows_what_a_run_needs():
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here (apt-get install systemd)")
-def test_systemd_takes_the_unit(tmp_path):
+def test_systemd_accepts_the_unit(tmp_path):
     copy = tmp_path / "tdhil.service"
     copy.write_text((DEPLOY / "tdhil.service").read_text().replace("/opt/tdhil/bin/tdhil", sys.executable))
     done = subprocess.run(["systemd-analyze", "verify", copy], capture_output=True, text=True)
@@ -160,7 +160,7 @@ def test_systemd_takes_the_unit(tmp_path):
 
 @pytest.mark.heavy
 @pytest.mark.skipif(sys.platform != "linux", reason="oom_score_adj is Linux's")
-def test_arithmetic_goes_first_where_memory_runs_out():
+def test_computation_is_killed_first_if_memory_runs_out():
     code = ("import pathlib, sys; from tdhil.service import worker; worker.main(['plan']);"
             "print(pathlib.Path('/proc/self/oom_score_adj').read_text(), file=sys.stderr)")
     done = subprocess.run([sys.executable, "-c", code], input=b"{}", capture_output=True)
@@ -170,7 +170,7 @@ def test_arithmetic_goes_first_where_memory_runs_out():
 # -- a container
 
 
-def test_the_container_s_recipe_names_what_there_is_and_nobody_s_registry():
+def test_the_recipe_of_the_container_names_existing_files_and_no_foreign_registry():
     text = (DEPLOY / "Dockerfile").read_text()
     steps = [line.split(maxsplit=1) for line in text.replace("\\\n", " ").splitlines() if re.match(r"[A-Z]+ ", line)]
     images = [rest.split()[0] for word, rest in steps if word == "FROM"]
@@ -189,7 +189,7 @@ def test_the_container_s_recipe_names_what_there_is_and_nobody_s_registry():
     assert build_parser("serve").parse_args(re.findall(r'"([^"]+)"', entry)[1:]).data == Path("/data")
     (check,) = [rest for word, rest in steps if word == "HEALTHCHECK"]
     code = re.findall(r'"([^"]+)"', check)[2]
-    for address in ("http://127.0.0.1:1", "https://127.0.0.1:1"):      # nobody there: unhealthy, and no other mistake
+    for address in ("http://127.0.0.1:1", "https://127.0.0.1:1"):      # no service: unhealthy, without another error
         done = subprocess.run([sys.executable, "-c", code.replace(":8420", ":1")], capture_output=True, text=True,
                               env={**os.environ, "TDHIL_HEALTH": address.partition(":")[0]})
         assert (done.returncode, "refused" in done.stderr) == (1, True), done.stderr

@@ -1,4 +1,4 @@
-"""Documents of ended runs that are kept: asked twice, computed once, and never older than their logs."""
+"""Cache of documents of ended runs: two requests, one computation, and never older than their logs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_calibration_is_kept_until_one_of_its_logs_changes(tmp_path):
     assert kept.get(kept.key("calibrate", asked)) is None
 
 
-def test_a_trend_is_its_rows_and_anything_else_is_computed_anew(tmp_path):
+def test_a_trend_depends_on_its_rows_and_anything_else_is_computed_again(tmp_path):
     kept = DocumentCache(tmp_path)
     kept.put(kept.key("trend", {"rows": [1], "rig": "a"}), {"n": 1})
     assert kept.get(kept.key("trend", {"rows": [1], "rig": "a"})) == {"n": 1}
@@ -51,7 +51,7 @@ def test_a_plan_is_kept_until_the_rig_s_file_changes(tmp_path):
     assert kept.get(kept.key("plan", asked)) is None
 
 
-def test_no_more_are_kept_than_memory_is_meant_for(tmp_path):
+def test_the_number_of_kept_documents_is_limited(tmp_path):
     kept = DocumentCache(tmp_path)
     for rig in range(MOST + 1):
         kept.put(kept.key("trend", {"rows": [], "rig": str(rig)}), {"n": rig})

@@ -1,4 +1,4 @@
-"""The door: idle connections are limited and closed, and a request always gets in. On loopback, with small limits."""
+"""Limits of connections: idle ones are limited and closed, and a request is always accepted. Small limits, loopback."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def upload(request: Request) -> Response:
 
 
 class Served:
-    """A door before a small application, in a thread; its clock is the test's."""
+    """Door before a small application, in a thread, with the clock of the test."""
 
     def __init__(self, room: Room = ROOM, tls: ssl.SSLContext | None = None) -> None:
         self.time_s = 0.0
@@ -72,7 +72,7 @@ class Served:
         await asyncio.sleep(0.05)
 
     def connect(self, host: str = "127.0.0.1", sent: bytes = b"") -> socket.socket:
-        """A client at an address of loopback."""
+        """Connect a client from an address of the loopback."""
         found = self._clients.enter_context(socket.create_connection(self.address, HANGS_S, (host, 0)))
         found.sendall(sent)
         return found
@@ -92,13 +92,13 @@ def served() -> Iterator[Served]:
 
 
 def stops(client: socket.socket) -> bool:
-    """Does a whole request get its answer?"""
+    """Return whether a whole request gets its reply."""
     client.sendall(HEADER + b"Connection: close\r\n\r\n")
     return b"stopped" in whole(client)
 
 
 def answered(client: socket.socket) -> bool:
-    """One answer of a connection that stays open."""
+    """Return one reply of a connection that stays open."""
     found = b""
     while not found.endswith(b"stopped") and (piece := client.recv(4096)):
         found += piece
@@ -125,12 +125,12 @@ def is_closed(client: socket.socket) -> bool:
         client.settimeout(HANGS_S)
 
 
-def test_a_request_gets_its_answer_in_pieces_and_one_after_the_other(served):
+def test_requests_in_parts_or_in_sequence_get_their_replies(served):
     client = served.connect(sent=HEADER[:20])
     wait_for("the piece", lambda: served.door.waiting == 1)
     client.sendall(HEADER[20:] + b"\r\n")
     assert answered(client)
-    client.sendall(HEADER + b"\r\n")                  # the same connection once more
+    client.sendall(HEADER + b"\r\n")                  # the same connection again
     assert answered(client)
     assert (served.door.waiting, served.door.served, served.said) == (0, 1, [])
 
@@ -143,7 +143,7 @@ def test_a_reply_does_not_wait_for_the_client_to_acknowledge_its_header(served):
 
 
 @pytest.mark.parametrize("sent", [b"", HEADER])
-def test_idle_connections_of_one_address_close_the_oldest_of_it_and_keep_nobody_out(served, sent):
+def test_idle_connections_of_one_address_close_its_oldest_and_lock_no_client_out(served, sent):
     other = served.connect("127.0.0.2")
     idle = [served.connect("127.0.0.3", sent) for _ in range(20)]
     wait_for("all of them", lambda: sum(map(is_closed, idle)) == 16)
@@ -178,7 +178,7 @@ def test_a_header_that_is_not_completed_in_time_ends_its_connection(served, sent
 
 @pytest.mark.parametrize("sent", [b"", HEADER[:30]])
 def test_a_client_that_goes_before_its_header_is_complete_leaves_nothing(served, sent):
-    """Its place is free at once, not only when its time is over: the clock stands."""
+    """Its place is free at once, before its time-out: the clock does not advance."""
     client = served.connect(sent=sent)
     wait_for("it", lambda: served.door.waiting == 1)
     client.close()
@@ -195,7 +195,7 @@ def test_a_body_that_is_not_completed_in_time_ends_its_connection(served):
     wait_for("its place", lambda: served.door.served == 0)
 
 
-def test_an_admitted_upload_may_take_longer_and_is_closed_to_make_room_only(served):
+def test_an_accepted_upload_may_take_longer_and_is_closed_only_if_connections_are_needed(served):
     slow = served.connect(sent=HEADER.replace(b"/stop", b"/upload").replace(b"Length: 0", b"Length: 9") + b"\r\nhalf")
     wait_for("it", lambda: any(one.rank == 1 for one in served.door._served))
     served.time_s = 10.0 * HEADERS_S
@@ -221,7 +221,7 @@ def test_connections_that_were_served_make_room_the_oldest_idle_one_first(served
 
 
 def at_the_server(method: str, complete: bool, more_body: bool = False) -> Any:
-    """A connection that the HTTP server has, of the address x."""
+    """Return a connection that the HTTP server has, of the address x."""
     protocol = SimpleNamespace(
         cycle=SimpleNamespace(response_complete=complete, more_body=more_body), scope={"method": method})
     found = door_module._Served(socket.socket(), "x", protocol, None)
@@ -229,7 +229,7 @@ def at_the_server(method: str, complete: bool, more_body: bool = False) -> Any:
     return found
 
 
-def test_what_is_gone_makes_room_before_what_is_open_and_its_address_forgets_it(served):
+def test_lost_connections_are_closed_before_open_ones_and_no_longer_count(served):
     door, gone, idle = served.door, at_the_server("GET", True), at_the_server("GET", True)
     gone.peer.close()
     among = door._served_of["x"] = dict.fromkeys([idle, gone])
@@ -237,7 +237,7 @@ def test_what_is_gone_makes_room_before_what_is_open_and_its_address_forgets_it(
     assert list(among) == [idle] and not idle.gone
     assert door._close_one(dict(among)) and idle.gone
     assert "x" not in door._served_of
-    assert door._close_one({}) is False                # nobody is there
+    assert door._close_one({}) is False                # the client is gone
 
 
 def test_a_door_that_was_never_opened_can_be_closed():
@@ -245,7 +245,7 @@ def test_a_door_that_was_never_opened_can_be_closed():
         Door(listening, ROOM, print).close()
 
 
-def test_what_is_answered_is_closed_after_what_is_idle_and_a_change_last(served):
+def test_idle_connections_are_closed_before_served_ones_and_changes_last(served):
     web_socket = at_the_server("GET", False)
     web_socket.transport.get_protocol = lambda: None
     change, load, idle = (at_the_server(*one) for one in (("POST", False), ("GET", False), ("GET", True)))
@@ -262,7 +262,7 @@ def test_what_is_answered_is_closed_after_what_is_idle_and_a_change_last(served)
     assert closed == [idle, half, new, web_socket, load, change]
 
 
-def test_a_process_without_descriptors_closes_an_idle_connection_and_says_so_once_a_second(served, monkeypatch):
+def test_a_process_without_descriptors_closes_an_idle_connection_and_reports_it_once_per_second(served, monkeypatch):
     idle = served.connect("127.0.0.3")
     wait_for("it", lambda: served.door.waiting == 1)
     none_left = threading.Event()
@@ -300,7 +300,7 @@ def test_a_line_comes_once_a_second_with_the_number_of_those_left_out():
     assert said == ["0", "3 (2 more such lines were left out)", "4"]
 
 
-def test_over_tls_a_request_gets_in_and_what_ends_no_handshake_or_sends_nothing_after_it_goes(tls):
+def test_over_tls_a_request_is_accepted_and_incomplete_connections_are_closed(tls):
     served = Served(tls=Tls(*tls).context())
     trusts = ssl.create_default_context(cafile=str(tls[0]))
     try:

@@ -1,4 +1,4 @@
-"""The stop of a run's own drive: which drive it goes to, what is seen there, and who that drive is."""
+"""Stop of the drive of a run: its target, its readings, and the identity of the drive."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.service.conftest import Service
 
 
 class OneDrive:
-    """A bus with one drive that is at rest."""
+    """Bus with one drive at standstill."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, identity: Identity | None, ended: Ended) -> None:
         self.asked: list[str] = []
@@ -48,7 +48,7 @@ def kept_file(service: Service, tmp_path: Path) -> Path:
     ((1, 2, 3, 4), "1,2,3,4", Ended.TURNING, 8), ((1, 2, 3, 5), "0,0,0,0", Ended.AT_REST, 0),
     ((1, 2, 3, 4), None, Ended.NO_ANSWER, 8), (None, "1,2,3,4", Ended.AT_REST, 0),
 ])
-def test_the_stop_of_a_run_s_drive_sees_who_it_is(kept_file, monkeypatch, capsys, numbers, wanted, ended, code):
+def test_the_stop_of_a_run_s_drive_reads_its_identity(kept_file, monkeypatch, capsys, numbers, wanted, ended, code):
     there = None if numbers is None else Identity(*numbers, "a drive", False)
     drive = OneDrive(monkeypatch, there, ended)
     assert drive_stop.main([str(kept_file), *([wanted] if wanted else [])]) == code
@@ -59,8 +59,8 @@ def test_the_stop_of_a_run_s_drive_sees_who_it_is(kept_file, monkeypatch, capsys
     assert found["same_drive"] is (numbers is None or wanted in (None, "0,0,0,0") or numbers[3] == 4)
 
 
-def test_a_drive_that_is_not_reached_is_not_at_rest(kept_file, tmp_path, capsys):
-    assert drive_stop.main([str(kept_file)]) == 8                  # nobody answers there
+def test_an_unreachable_drive_is_not_at_standstill(kept_file, tmp_path, capsys):
+    assert drive_stop.main([str(kept_file)]) == 8                  # no reply at this address
     found = json.loads(capsys.readouterr().out)
     assert found["ended"] == "not reached"
     assert "127.0.0.1:" in found["error"]

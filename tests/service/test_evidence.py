@@ -1,4 +1,4 @@
-"""The archive of evidence of a run over HTTP: the audit, the download, every mistake at its field."""
+"""Archive of evidence of a run over HTTP: audit, download, and every error at its field."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATED = {"publisher": "The Institute", "publish": "log,result,identity", "remov
 
 @pytest.fixture
 def run(call, service, monkeypatch):
-    """A run with the log of a real drive; its identification is played."""
+    """Return a run with the log of a real drive; its identification is simulated."""
     play_uploads(service, monkeypatch)
     monkeypatch.setattr("tdhil.evidence.making.make_evidence", partial(make_evidence, conclude=found))
     which = ended(call, service)
@@ -47,12 +47,12 @@ def test_an_archive_is_made_downloaded_and_audited(call, service, client, run):
     assert len(key.read_bytes()) == 32 and key.stat().st_mode & 0o77 == 0
 
 
-def test_every_mistake_of_the_statement_is_said_at_its_field(call, service, run):
+def test_every_error_of_the_statement_is_reported_at_its_field(call, service, run):
     sent = {"publish": "photo", "reference_inertia_kg_m2": "-1", "reference_method": "guessed"}
     refused = call("POST", f"/runs/{run}/evidence", 422, json=sent)
     assert {one["option"] for one in refused["fields"]} == {
         "publisher", "publish", "reference_inertia_kg_m2", "reference_sd_kg_m2", "reference_method", "reference_note"}
-    labels = {one["option"]: one["label"] for one in refused["fields"]}     # as on the form, not the option's name
+    labels = {one["option"]: one["label"] for one in refused["fields"]}     # the label of the form, not the option
     assert labels["publisher"] == "Publisher: who permits this" and labels["reference_note"] == "How, in words"
     call("POST", f"/runs/{run}/evidence", 422, json={**STATED, "photo": 1})
     assert not noted(service, "evidence requested")

@@ -1,4 +1,4 @@
-"""The Foxglove protocol: the log's own bytes, to whoever reads at his own pace, and nothing that he could change."""
+"""Foxglove protocol: the bytes of the log for viewers of any speed, read only."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Message = tuple[str, int, bytes]           # topic, log time in ns, payload
 
 
 def logged(path: Path) -> list[Message]:
-    """By mcap's own reader, in the order of the file."""
+    """Return the messages by mcap's own reader, in the order of the file."""
     with path.open("rb") as file:
         return [(channel.topic, message.log_time, message.data)
                 for _, channel, message in make_reader(file).iter_messages(log_time_order=False)]
@@ -58,7 +58,7 @@ def by_topic(messages: list[Message]) -> dict[str, list[tuple[int, bytes]]]:
 
 
 class Viewer:
-    """A small client of the protocol: decodes by the specification, shares nothing with the relay."""
+    """Small client of the protocol: it decodes by the specification and shares no code with the relay."""
 
     def __init__(self, send: Callable[[str], Any]) -> None:
         self._send = send
@@ -90,7 +90,7 @@ class Viewer:
 
 @contextmanager
 def listening(web: Web) -> Iterator[int]:
-    """The web on a socket as `tdhil serve` opens it: its port."""
+    """Yield the port of the web server on a socket, opened as by `tdhil serve`."""
     config = uvicorn.Config(web.asgi, log_level="error", ws="websockets-sansio", ws_max_size=4096)
     server, opened = uvicorn.Server(config), _listen("127.0.0.1", 0)
     thread = threading.Thread(target=server.run, args=([opened],), daemon=True)
@@ -104,7 +104,7 @@ def listening(web: Web) -> Iterator[int]:
 
 
 def moving(service: Service, samples: int = 200) -> tuple[str, Path]:
-    """A run whose log is there, and it."""
+    """Return a run with an existing log, and the log."""
     run = service.supervisor.start_run("a", {"note": "hold"}, "test").request.id
     service.wait(run, "moving")
     path = service.store.place(run) / "run.mcap"
@@ -114,8 +114,8 @@ def moving(service: Service, samples: int = 200) -> tuple[str, Path]:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
-    """Over a real socket, by `websockets`: every message of a growing log, byte for byte, under the log's schemas."""
+def test_an_independent_client_receives_the_content_of_the_log(service, protocol):
+    """`websockets` reads every message of a growing log over a real socket, byte for byte, with the log's schemas."""
     with listening(service.web) as port, connect(
             f"ws://127.0.0.1:{port}/foxglove/a", subprotocols=[protocol], open_timeout=HANGS_S) as peer:
         assert peer.subprotocol == protocol
@@ -141,8 +141,8 @@ def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
 
 
 @pytest.mark.heavy
-def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
-    """So that what is asked of him, is he still there, doesn't wait behind what he hasn't read: he isn't cut off."""
+def test_a_slow_viewer_has_few_bytes_in_transit(service, monkeypatch):
+    """A ping must not wait behind unread data, so that the connection of a slow viewer is not closed."""
     sent: list[int] = []
 
     def counted(*words: Any) -> Relay:
@@ -164,7 +164,7 @@ def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
         raw.sendall(f"GET /foxglove/a HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
                     f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n"
                     f"Sec-WebSocket-Protocol: {PROTOCOLS[0]}\r\n\r\n".encode())
-        raw.recv(1)                                        # it has said yes
+        raw.recv(1)                                        # it has accepted
         wanted = json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 1},
                                                                   {"id": 2, "channelId": 2}]}).encode()
         raw.sendall(b"\x81" + bytes([0x80 | len(wanted)]) + bytes(4) + wanted)          # masked by zeros
@@ -180,7 +180,7 @@ def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
 
 
 class Bench:
-    """A relay whose viewer is the test: what it sends is taken at once, and may cost time."""
+    """Relay with the test as the viewer. Messages are accepted at once, or each takes ``costs_s``."""
 
     def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(foxglove, "EVERY_S", 0.001)
@@ -222,7 +222,7 @@ def bench(tmp_path, monkeypatch):
     return Bench(tmp_path / "run.mcap", monkeypatch)
 
 
-def test_who_subscribes_late_gets_it_from_its_start_and_once(bench, tmp_path):
+def test_a_late_subscriber_gets_it_from_its_start_and_once(bench, tmp_path):
     writer = RunWriter(tmp_path / "run.mcap", epoch_ns=10**18, block=True)
 
     def grow(first: int, last: int) -> None:
@@ -253,7 +253,7 @@ def test_who_subscribes_late_gets_it_from_its_start_and_once(bench, tmp_path):
     assert sorted(found) == ["/event", "/sample", "/stage"]
 
 
-def test_the_next_run_is_a_session_of_its_own(bench, tmp_path):
+def test_the_next_run_is_a_new_session(bench, tmp_path):
     write(tmp_path / "run.mcap")
     write(tmp_path / "two.mcap", 50)
 
@@ -285,7 +285,7 @@ def test_a_rehearsal_is_marked_in_the_name_and_in_the_metadata(bench, tmp_path):
     assert (second["name"], second["metadata"]["rehearsal"]) == ("tdhil, rig a SIMULATED", "false")
 
 
-def test_a_run_that_died_is_let_go_of(bench, tmp_path):
+def test_a_dead_run_is_closed(bench, tmp_path):
     write(tmp_path / "whole.mcap")
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "run.mcap").write_bytes(data[:-1000])
@@ -299,8 +299,8 @@ def test_a_run_that_died_is_let_go_of(bench, tmp_path):
     bench.play(played)
 
 
-def test_who_is_too_slow_loses_what_comes_every_cycle_and_is_told(bench, tmp_path):
-    """It is sent at a second each: what was there before it came for a minute, then stages, events and results."""
+def test_a_viewer_that_is_too_slow_loses_messages_of_every_cycle_and_a_status_reports_it(bench, tmp_path):
+    """Each message takes 1 s: first a minute of earlier data, then stages, events and results only."""
     write(tmp_path / "run.mcap")
 
     async def played() -> None:
@@ -341,10 +341,10 @@ def test_a_viewer_can_only_read(bench, said, answer):
     assert answer in bench.viewer.statuses()[-1]
 
 
-# -- the road to it --------------------------------------------------------------------------------------------------
+# -- access -----------------------------------------------------------------------------------------------------
 
 
-def test_a_rig_that_is_none_and_a_protocol_that_is_none_are_refused(service):
+def test_an_unknown_rig_and_an_unknown_protocol_are_refused(service):
     with TestClient(service.web.asgi, base_url=URL) as client:
         for path, protocols, code in (("/foxglove/none", PROTOCOLS[:1], 404), ("/foxglove/a", ["foxglove.v9"], 400),
                                       (f"{API}/foxglove/a", [], 400)):

@@ -1,4 +1,4 @@
-"""The pages in several languages: every text is wrapped, each catalogue is complete, and no machine sees a comma."""
+"""Pages in several languages: every text is marked, each catalogue is complete, and the API has no decimal comma."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ BARE = {
     "tdhil": "name of the program", "rad/s": "unit", "rad/s²": "unit", "rad": "unit", "N·m": "unit",
     "kg·m²": "unit", "rpm": "unit",
     "PNG": "format", "CSV": "format", "SHA-256": "name of the hash", "rig.yaml": "name of a file",
-    "run.mcap": "name of a file", "trace.csv": "name of a file", "report.html": "name of a file",
+    "run.mcap": "name of a file", "recovered.mcap": "name of a file", "trace.csv": "name of a file",
+    "report.html": "name of a file",
     "report.pdf": "name of a file", "result.json": "name of a file", "samples.csv": "name of a file",
     "evidence.zip": "name of a file",
     "fleet.csv": "name of a file", "calibration.json": "name of a file", "A4": "size of paper",
@@ -49,7 +50,7 @@ NO_TEXT = re.compile(
     r"""|\(prefers-color-scheme: dark\)|tdhil \$\{\}|time_s,speed_rad_s,torque_nm|rehearsal: \$\{\}"""
     r"""|[^ ]*[/=&#\[\]_@{}][^ ]*|.*sans-serif|rotate\(.*\)|(?:[\w.]*\$\{\})+[\w.-]*|tdhil[\w-]*(\$\{\})?"""
     r"""|by hand|now alarm|verdict good""")
-"""Literals of a script that no reader sees, or that are data: addresses, headers, classes, formats of dates."""
+"""Literals of a script that are not visible, or are data: addresses, headers, classes, formats of dates."""
 UNITS = re.compile(r"\$\{\}|[^\w]|N·m(·s/rad)?|kg·m²|rad|Hz|KiB|MiB|min|s\b|SHA-256|\d")
 NOT_SHOWN = re.compile(
     r"(?:class|[cC]lassName|id|type|href|role|scope|kind|key|for|tag|fill|stroke|lang|textAlign|textBaseline|font|name"
@@ -59,7 +60,7 @@ NOT_SHOWN = re.compile(
 
 
 class Shown(HTMLParser):
-    """Texts and attributes of a page that a reader sees, without those of code."""
+    """Visible texts and attributes of a page, without those of code."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -82,7 +83,7 @@ class Shown(HTMLParser):
 
 
 def bare(template: str) -> list[str]:
-    """Texts of a template that are not in `_()`."""
+    """Return the texts of a template that are not in `_()`."""
     parser = Shown()
     template = re.sub(r"\{% block data %\}.*?\{% endblock %\}", "", template)
     parser.feed(re.sub(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", "·", template, flags=re.DOTALL))
@@ -103,7 +104,7 @@ def test_each_text_of_a_template_is_wrapped(path):
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
 def test_each_text_of_a_script_is_wrapped(path):
-    """A literal of two words, or of one with a capital, is a text, unless the code before it says what else it is."""
+    """A literal of two words, or of one with a capital, is a text, unless the code before it shows another use."""
     found = [(one.line, one.text) for one in literals(path.read_text(encoding="utf-8"))
              if re.search(r"[A-Za-z]{2,} |^[A-Z][a-z]+", one.text) and not one.before.endswith("tr(")
              and not NO_TEXT.fullmatch(one.text) and re.search("[A-Za-z]{2,}", UNITS.sub("", one.text))
@@ -121,7 +122,7 @@ def test_the_search_for_bare_texts_finds_them():
 
 @pytest.mark.parametrize("path", CATALOGUES, ids=lambda path: path.name)
 def test_a_catalogue_has_each_text_and_no_other(path):
-    """`python -m tests.service.catalogue` brings it up to date; the translations are typed."""
+    """`python -m tests.service.catalogue` updates it. Translations are entered by hand."""
     text = path.read_text(encoding="utf-8")
     assert text == updated(text)
     assert [one["msgid"] for one in entries(text)[1:] if not one["msgstr"] or "fuzzy" in one.get("flags", "")] == []
@@ -183,7 +184,7 @@ def test_a_page_has_the_language_of_its_reader(client):
 
 
 def test_a_machine_gets_the_same_bytes_in_each_language(client, service):
-    """Every document of the API, errors included: only pages have a language."""
+    """Every document of the API is the same, errors included. Only pages have a language."""
     run = service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     service.wait(run, "done")
     service.supervisor.close()
@@ -212,7 +213,7 @@ console.log(JSON.stringify(calls.map(([name, ...given]) => window.tdhilLanguage[
 
 
 def in_script(tag: str, *calls: list[object]) -> list[object]:
-    """Results of functions of texts.js, called in node."""
+    """Return the results of functions of texts.js, called in node."""
     text = json.dumps([tag, languages()[tag].script(), calls])
     done = subprocess.run(["node", "-e", SCRIPT, str(ROOT / "tdhil/service/static/texts.js")], input=text, text=True,
                           capture_output=True, timeout=600, check=True)
@@ -221,7 +222,7 @@ def in_script(tag: str, *calls: list[object]) -> list[object]:
 
 
 @pytest.mark.heavy
-def test_numbers_of_a_script_have_the_sign_of_the_language_and_send_a_point():
+def test_numbers_of_a_script_are_shown_in_the_language_and_sent_with_a_point():
     if shutil.which("node") is None:
         pytest.skip("no node: tests/service/chromium/test_german.py shows the same in Chromium")
     calls = [["fixed", 1234.5, 2], ["precise", 0.00001234, 2], ["local", "-1.5e-7"], ["tick", 1234.5],

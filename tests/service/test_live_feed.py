@@ -1,4 +1,4 @@
-"""What a page is sent of a growing log: thin enough, from its start, and with its age."""
+"""Live data of a growing log for a page: thinned, from its start, and with its age."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def news(first_s: float, count: int, every_s: float = 0.004, **more: object) -> 
     return LogNews(np.column_stack((time_s, 0.1 * time_s, -time_s)), **more)
 
 
-def test_it_is_thin_whatever_pieces_it_comes_in():
+def test_it_is_thinned_for_any_size_of_parts():
     whole, pieces = LivePicture(), LivePicture()
     all_of_it = news(0.0, 1000)
     whole.take(all_of_it, 0.0)
@@ -67,21 +67,21 @@ def test_a_rehearsal_is_marked_for_every_viewer():
     assert picture.whole()["rehearsed_faults"] == ["sto@hold+2s"]
 
 
-def test_what_is_no_number_is_none_in_json():
+def test_nan_is_null_in_json():
     picture = LivePicture()
     shown = picture.take(LogNews(np.array([[0.0, np.nan, np.inf]])), 0.0)
     assert json.dumps(shown, allow_nan=False)
     assert shown["samples"] == [[0.0], [None], [None]]
 
 
-def test_j_during_the_run_comes_with_every_digit_and_late_viewers_get_all_of_it():
+def test_j_during_the_run_has_every_digit_and_late_viewers_get_all_values():
     picture, found = LivePicture(), [LiveInertia(20.0 * k, k, 0.95, "valid", "", 104.0 + 1e-12 * k) for k in (1, 2)]
     for one in found:
         assert picture.take(LogNews(inertias=(one,)), 0.0)["inertias"] == [asdict(one)]
     assert json.loads(json.dumps(picture.whole()))["inertias"] == [asdict(one) for one in found]
 
 
-def test_a_moving_run_is_told_once_that_a_page_shows_it(tmp_path):
+def test_a_moving_run_is_notified_once_that_a_page_shows_it(tmp_path):
     told, state = [], ["preflight"]
 
     def tell():
@@ -97,8 +97,8 @@ def test_a_moving_run_is_told_once_that_a_page_shows_it(tmp_path):
     assert told == ["moving", "moving"]
 
 
-def test_a_viewer_that_comes_back_is_sent_no_old_state(tmp_path):
-    """The page of an ended run took the state "moving" for the present, and left for the result."""
+def test_a_viewer_that_returns_is_sent_no_old_state(tmp_path):
+    """The page of an ended run used to accept the state "moving" as the present one, and then changed to the result."""
     states = [State.MOVING]
     feed = Feed(tmp_path / "run.mcap", lambda: Status("1", "a", (Entered(states[-1], ""),)))
 
@@ -163,7 +163,7 @@ def test_the_last_live_value_of_a_whole_run_is_that_of_its_result(service, tmp_p
 
 
 class Gone:
-    """A WebSocket whose other end goes while it is written to."""
+    """WebSocket whose peer closes during a write."""
 
     def __init__(self, **names: str) -> None:
         self.path_params, self.scope = names, {"subprotocols": ["foxglove.sdk.v1"]}
@@ -180,7 +180,7 @@ class Gone:
 
 
 @pytest.mark.parametrize("road", ["watch", "foxglove"])
-def test_a_viewer_that_goes_in_mid_word_is_no_mistake_of_ours(service, road):
+def test_a_viewer_that_closes_during_a_message_is_no_error(service, road):
     run = service.supervisor.start_run("a", {}, "test").request.id
     asyncio.run(getattr(service.web, f"_{road}")(Gone(run=run, rig="a")))
     assert service.web.feeds.viewers == 0

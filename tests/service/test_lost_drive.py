@@ -1,4 +1,4 @@
-"""A run's process is lost or stands still: which drive is then stopped, and what is said of it; without a drive."""
+"""Lost or frozen process of a run: the drive that is then stopped, and the messages; without a real drive."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.service.conftest import Service, wait_for
 
 
 class Stops:
-    """In the place of the stop's process: which commands there were, and what the next one saw."""
+    """Replacement of the stop process: it records commands and gives the readings of the next stop."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.commands: list[list[str]] = []
@@ -47,7 +47,7 @@ def stops(monkeypatch: pytest.MonkeyPatch) -> Stops:
 
 
 def lost_run(service: Service, *, kept: bool = True, change: Callable[[Path], object] = lambda path: None) -> str:
-    """A run on the rig `real` whose process is killed after the rig's file was changed."""
+    """Return a run on the rig `real` whose process is killed after a change of the rig's file."""
     service.supervisor.start()
     rig = service.supervisor.rigs.get("real")
     run = service.supervisor.start_run("real", {"note": "ask"}, "local").request.id
@@ -66,7 +66,7 @@ def other_port(path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_the_stop_after_a_lost_run_goes_where_the_run_went(service, stops):
+def test_the_stop_after_a_lost_run_goes_to_the_drive_of_the_run(service, stops):
     run = lost_run(service)
     assert stops.commands == [["tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE)]]
     status = service.store.status(run)
@@ -78,8 +78,8 @@ def test_the_stop_after_a_lost_run_goes_where_the_run_went(service, stops):
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("change", [other_port, lambda path: path.write_text(path.read_text() + "# a word\n"),
                                     lambda path: path.unlink()])
-def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(service, stops, change):
-    """Another drive may be the rig's by now: that the run's own was seen at rest says nothing of that one."""
+def test_a_rig_s_file_that_was_changed_in_the_meantime_leaves_the_stop_unconfirmed(service, stops, change):
+    """The rig may have another drive now. Standstill of the run's drive shows nothing about that one."""
     path = service.supervisor.rigs.get("real").path
     before = path.read_text()
     run = lost_run(service, change=change)
@@ -122,8 +122,8 @@ def test_without_a_kept_connection_and_with_another_file_no_drive_is_stopped(ser
 
 
 @pytest.mark.heavy
-def test_a_drive_that_was_not_seen_at_rest_blocks_its_rig_and_stop_goes_to_it(service, stops):
-    """Its rig's Stop goes to the run's own drive, whatever the file says by then."""
+def test_a_drive_without_confirmed_standstill_blocks_its_rig_and_stop_goes_to_it(service, stops):
+    """The Stop of its rig goes to the drive of the run, with any later file."""
     stops.code, stops.said = 8, "is not JSON"
     run = lost_run(service)
     status = service.store.status(run)
@@ -150,7 +150,7 @@ def test_a_drive_that_was_not_seen_at_rest_blocks_its_rig_and_stop_goes_to_it(se
 
 
 @pytest.mark.heavy
-def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, monkeypatch):
+def test_another_drive_at_the_address_of_the_run_is_not_accepted(service, stops, monkeypatch):
     stops.code, stops.said = 8, json.dumps({"at_rest": True, "same_drive": False, "identity": "1, 2, 3, 99"})
     status = service.store.status
 
@@ -164,11 +164,11 @@ def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, mon
     assert "another drive (1, 2, 3, 99) replied at the address of the run" in service.store.status(run).error.what
 
 
-# -- a process that stands still
+# -- a frozen process
 
 
 @pytest.mark.heavy
-def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_was_seen(call, service, stops):
+def test_a_stop_to_a_frozen_process_kills_it_and_reports_an_unconfirmed_stop(call, service, stops):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")
     write_json(service.store.place(run) / CONNECTION_FILE,
@@ -186,19 +186,19 @@ def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_wa
     assert (status.stop.by, status.stop.confirmed, status.stop.seen) == ("local", True, None)
     assert status.stop.asked <= status.stop.at_rest
     with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGCONT)                   # it has nothing left to go on with
+        os.kill(pid, signal.SIGCONT)                   # it cannot continue
     wait_for("the audit", lambda: [one.details for one in service.audit.entries() if one.what == "stop asked"] == [
         {"process": "stood still", "killed": True}])
 
 
 def suspend(pid: int) -> None:
-    """A signal is on its way for a moment; a process that still runs would answer a Stop."""
+    """Suspend the process and wait for the signal. A running process would reply to a Stop."""
     os.kill(pid, signal.SIGSTOP)
     wait_for("its standstill", lambda: stands_still(pid))
 
 
 @pytest.mark.heavy
-def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
+def test_a_rig_with_a_frozen_run_gives_the_same_reply(call, service):
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")
     suspend(service.store.status(run).pid)
@@ -206,7 +206,7 @@ def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
     service.wait(run, "interrupted")
 
 
-def test_a_process_that_stands_still_and_cannot_be_killed_is_told_as_such(call, service, monkeypatch):
+def test_a_frozen_process_that_cannot_be_killed_is_reported(call, service, monkeypatch):
     run = call.start("a", what="hold")["id"]
     service.wait(run, "moving")
     pid = service.store.status(run).pid
@@ -220,7 +220,7 @@ def test_a_process_that_stands_still_and_cannot_be_killed_is_told_as_such(call, 
     service.wait(run, "stopped")
 
 
-def test_standing_still_is_known_of_a_living_process_alone():
+def test_only_a_live_process_can_be_frozen():
     with subprocess.Popen(["sleep", "60"]) as child:
         assert not stands_still(child.pid)
         os.kill(child.pid, signal.SIGSTOP)

@@ -1,4 +1,4 @@
-"""A run's process is killed while it turns a drive in another process: what then stops the shaft, and what is kept."""
+"""Killed process of a run that turns a drive in another process: stop of the shaft, and kept data."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from tests.rigs import PATIENT_LIMITS, rig_file
 from tests.service.conftest import Service, wait_for
 
 simulated_drive = partial(modbus_peer, program=("-m", "tdhil", "simulate"))
-"""Behind a wire it is a drive like any other but for its marker."""
+"""Simulated drive in another process: a drive like any other except for its marker."""
 
 
 def attended_rig(port: object) -> str:
-    """Return the rig.yaml of a Modbus drive that a person at the shaft releases."""
+    """Return the rig.yaml of a Modbus drive whose motion an operator confirms."""
     return (f"name: bench 3\nrate_hz: 10\nmodbus: {{host: 127.0.0.1, port: {port}}}\n{PATIENT_LIMITS}"
             "service: {motion: attended}\n")
 
 
 def speed_rad_s(trace: Path) -> float:
-    """The shaft's, as it is now."""
+    """Return the present speed of the shaft."""
     lines = trace.read_text().splitlines()
     return float(lines[-2].split(",")[1]) if len(lines) > 3 else 0.0
 
 
 @pytest.mark.heavy
 @pytest.mark.real_time
-def test_the_shaft_comes_to_rest_the_run_is_told_of_and_its_log_kept(tmp_path):
+def test_the_shaft_comes_to_standstill_and_the_run_is_reported_with_its_log(tmp_path):
     rigs, trace = tmp_path / "rigs", tmp_path / "shaft.csv"
     rigs.mkdir()
     with simulated_drive(trace) as drive:
@@ -56,13 +56,13 @@ def test_the_shaft_comes_to_rest_the_run_is_told_of_and_its_log_kept(tmp_path):
     assert status.history[-2].state is State.MOVING
     assert len(read_run(service.store.place(run) / "recovered.mcap").recording.time_s) > 10
     with pytest.raises(FileNotFoundError):
-        (service.store.place(run) / "confirm.json").read_bytes()       # a drive with the marker asks nobody
+        (service.store.place(run) / "confirm.json").read_bytes()       # a drive with the marker needs no confirmation
 
 
 @pytest.mark.heavy
 @pytest.mark.real_time
-def test_a_rig_s_file_that_names_another_drive_by_then_does_not_get_that_one_stopped(tmp_path):
-    """The issue's own case: the other drive was stopped, and its rest was taken for that of the run's."""
+def test_if_the_rig_s_file_names_another_drive_that_one_is_not_stopped(tmp_path):
+    """The other drive was stopped in the reported case, and its standstill was attributed to the drive of the run."""
     rigs = tmp_path / "rigs"
     rigs.mkdir()
     with simulated_drive(tmp_path / "own.csv") as drive, simulated_drive(tmp_path / "other.csv") as other:

@@ -1,4 +1,4 @@
-"""E-mails on ended runs and changed rigs, to a mail server that the test plays by RFC 5321."""
+"""E-mails on ended runs and changed rigs, to a mail server of the test (RFC 5321)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FROM = {SENDER: "tdhil@bench.example"}
 
 
 class Server(threading.Thread):
-    """``got``: (recipients, message as it came). ``replies``: replies to a command instead of the usual one."""
+    """Mail server. ``got``: (recipients, message as received). ``replies``: unusual replies to commands."""
 
     def __init__(self, **replies: str) -> None:
         super().__init__(daemon=True)
@@ -121,7 +121,7 @@ def test_an_e_mail_that_is_refused_is_reported(server, monkeypatch, verb, reply)
     assert len(said) == 1 and said[0].startswith("Mail: chief@example.com") and "was not delivered" in said[0]
 
 
-def test_a_server_that_is_gone_is_an_error(server):
+def test_a_missing_server_is_an_error(server):
     found = mail(server)
     server.close()
     with pytest.raises(OSError):

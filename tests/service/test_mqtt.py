@@ -1,4 +1,4 @@
-"""What a broker is told: retained, at least once, and never anything that could be a command to us."""
+"""Messages to a broker: retained, at least once, and without subscriptions, so no commands are possible."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 1, 2, 3, 4, 14        # MQTT 3.1
 
 
 class Heard:
-    """The broker's end of the wire, by the specification: acknowledges, and notes down every packet."""
+    """Broker by the specification: it acknowledges and records every packet."""
 
     def __init__(self, port: int = 0, tls: ssl.SSLContext | None = None, at: socket.socket | None = None) -> None:
         self._tls = tls
@@ -104,7 +104,7 @@ def publishing(port: int, look: Any, said: list[str], **more: Any) -> Iterator[P
 
 
 @pytest.mark.heavy
-def test_states_and_results_are_told_as_they_change(service):
+def test_states_and_results_are_published_as_they_change(service):
     heard, said = Heard(), []
     with publishing(heard.port, service.web.broker_messages, said):
         wait_for("the state", lambda: "site/1/rigs/a/state" in heard.last())
@@ -131,14 +131,14 @@ def test_states_and_results_are_told_as_they_change(service):
     assert connect[7] & 0b0011_1100 == 0b0010_1100         # a last will: QoS 1, retained
     assert b"site/1/status\x00\x07offline" in connect
     same = [one for one in heard.published() if one[0].endswith("never/state")]
-    assert len(same) == 1                                  # told once, as long as it stays
+    assert len(same) == 1                                  # sent once, while it does not change
     heard.close()
 
 
-def test_a_broker_that_is_away_delays_nothing_and_is_told_it_all_when_it_comes():
+def test_a_missing_broker_delays_nothing_and_receives_everything_later():
     taken = socket.socket()
     taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    taken.bind(("127.0.0.1", 0))           # nobody listens there, and nobody else comes there meanwhile
+    taken.bind(("127.0.0.1", 0))           # a reserved port without a server
     port = taken.getsockname()[1]
     said: list[str] = []
     state = {"rigs/a/state": {"is": 1}, "rigs/b/state": {"is": 1}}
@@ -159,7 +159,7 @@ def test_a_broker_that_is_away_delays_nothing_and_is_told_it_all_when_it_comes()
     assert [one for one in said if "tries again" in one] == [one for one in said if "are sent to" not in one]
 
 
-def test_what_cannot_be_looked_up_is_said_once_and_told_later():
+def test_a_failed_read_is_reported_once_and_published_later():
     heard, said, looks = Heard(), [], []
 
     def look() -> dict[str, Any]:
@@ -174,8 +174,8 @@ def test_what_cannot_be_looked_up_is_said_once_and_told_later():
     heard.close()
 
 
-def test_an_end_without_a_broker_waits_for_nobody():
-    silent = socket.create_server(("127.0.0.1", 0))        # takes connections, and says nothing
+def test_the_end_without_a_broker_does_not_wait():
+    silent = socket.create_server(("127.0.0.1", 0))        # accepts connections without a reply
     for port in (silent.getsockname()[1], 1):
         with publishing(port, dict, []) as publisher:
             begun_s = time.monotonic()
@@ -200,8 +200,8 @@ def test_a_password_comes_from_a_file_and_is_shown_nowhere(tmp_path):
     heard.close()
 
 
-def test_a_broker_s_certificate_is_looked_at_before_anything_is_told(tls, tmp_path):
-    """One that nobody vouches for is sent nothing, no password above all."""
+def test_the_certificate_of_a_broker_is_checked_before_any_message(tls, tmp_path):
+    """A broker with an untrusted certificate receives nothing, in particular no password."""
     cert, key = tls
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(cert, key)
@@ -241,7 +241,7 @@ def test_an_address_that_is_none_is_refused_before_anything_begins(url, words, c
     assert not (tmp_path / "data").exists()
 
 
-def test_addresses_and_what_stands_beside_them():
+def test_addresses_and_their_options():
     assert str(Broker.of("mqtts://broker.example", {})) == "mqtts://broker.example:8883/tdhil"
     assert Broker.of("mqtt://[::1]/a/b/", {"TDHIL_MQTT_USER": "u", "TDHIL_MQTT_PASSWORD": "p"}) == Broker(
         "::1", 1883, False, "a/b", "u", "p")
@@ -267,8 +267,8 @@ def viewing(port: int) -> tuple[dict[str, tuple[str, bool, int]], Client]:
 
 @pytest.mark.heavy
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="mosquitto is not installed (apt-get install mosquitto)")
-def test_a_real_broker_keeps_it_for_who_comes_later(service, tmp_path):
-    """mosquitto: who subscribes afterwards gets the latest, and after a kill the last will."""
+def test_a_real_broker_keeps_it_for_later_subscribers(service, tmp_path):
+    """With mosquitto, a later subscriber gets the latest message, and after a kill the last will."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     (tmp_path / "m.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\n")
@@ -279,7 +279,7 @@ def test_a_real_broker_keeps_it_for_who_comes_later(service, tmp_path):
             run = service.supervisor.start_run("a", {}, "test").request.id
             service.wait(run, "done")
             wait_for("the result", lambda: "rigs/a/result" in publisher._published)
-            early, first = viewing(port)          # the broker may get the result after the publisher has noted it
+            early, first = viewing(port)          # the broker may receive the result later than recorded
             wait_for("the broker's copy", lambda: "site/1/rigs/a/result" in early)
             first.loop_stop()
             kept, viewer = viewing(port)

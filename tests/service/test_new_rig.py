@@ -1,4 +1,4 @@
-"""A rig that is added in the browser: every profile's draft, its mistakes at their fields, its file, and a scan."""
+"""Rig that is added in the browser: draft of every profile, errors at their fields, its file, and a scan."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ADDRESS = {"canopen": {"interface": "socketcan", "channel": "can0", "bitrate": "
 
 
 def complete(profile, **changed):
-    """A draft of this profile with every entry that it asks for."""
+    """Return a draft of this profile with every requested entry."""
     view = next(one for one in new_rig_view().profiles if one.name == profile)
     return DraftBody(**{
         "profile": profile, "name": "bench 3", "load": "string", "address": ADDRESS[view.bus], "limits": LIMITS,
@@ -39,7 +39,7 @@ def complete(profile, **changed):
 
 
 @pytest.mark.parametrize("name", sorted(profile_names()))
-def test_a_complete_draft_of_each_profile_is_a_file_without_a_mistake(name):
+def test_a_complete_draft_of_each_profile_is_a_valid_file(name):
     found = draft_of(complete(name))
     assert found.problems == []
     rig = parse_rig(found.text, "rig.yaml")
@@ -81,7 +81,7 @@ def test_a_parameter_is_shown_with_the_value_that_it_must_have():
     view = next(one for one in new_rig_view().profiles if one.name == "siemens/g120")
     required = {one.name: one.required for one in view.parameters}
     assert required["parameters.control_mode"] == "20" and required["parameters.reference_torque"] == ""
-    assert required["parameters.monitoring_time"] == "at least 0.4 s"       # the drive's own display has ms
+    assert required["parameters.monitoring_time"] == "at least 0.4 s"       # the display of the drive has ms
     units = {one.name: one.unit for one in view.parameters}
     assert units["parameters.reference_torque"] == "N·m" and units["parameters.control_mode"] == ""
     assert "p2040 monitoring time of the field bus: at least 0.4 s" in view.by_hand
@@ -104,11 +104,11 @@ def fields_of(**changed):
     ({"simulated": True, "limits": {"torque_nm": "400"}}, "limits.time_s", "all limits or none"),
     ({"accept_unverified": []}, "accept_unverified", "only if both agree: modes, quick_stop"),
 ])
-def test_a_mistake_is_marked_at_its_field(changed, field, said):
+def test_an_error_is_marked_at_its_field(changed, field, said):
     assert said in fields_of(**changed)[field]
 
 
-def test_every_mistake_is_shown_at_once():
+def test_all_errors_are_shown_at_once():
     found = fields_of(name="", address={}, limits={}, string={}, accept_unverified=[])
     assert "load" not in found         # each key is marked at its own field
     assert {"name", "address", "accept_unverified", *(f"limits.{key}" for key in LIMITS), *STRING} <= found.keys()
@@ -162,7 +162,7 @@ def test_a_simulated_rig_is_ready_to_start(call):
     assert (made["simulated"], made["state"]) == (True, "free")
 
 
-def test_a_rig_is_added_once_and_the_audit_says_so(call, service):
+def test_a_rig_is_added_once_with_an_audit_entry(call, service):
     text = call("POST", "/new-rig/draft", 200, json=vars(complete("generic/modbus", motion="never")))["text"]
     made = call("POST", "/rigs", 201, json={"id": "bench-3", "text": text})
     assert (made["id"], made["name"], made["motion"], made["state"]) == ("bench-3", "bench 3", "never", "free")
@@ -173,7 +173,7 @@ def test_a_rig_is_added_once_and_the_audit_says_so(call, service):
 
 
 @pytest.mark.parametrize("rig", ["", "../x", "a/b", ".x", "a" * 65, "x\n", "a\0"])
-def test_an_id_that_is_none_writes_nothing(call, service, rig):
+def test_an_invalid_id_writes_nothing(call, service, rig):
     before = sorted(service.supervisor.rigs.folder.iterdir())
     call("POST", "/rigs", 422, json={"id": rig, "text": "name: x\n"})
     assert sorted(service.supervisor.rigs.folder.iterdir()) == before
@@ -184,12 +184,12 @@ def test_an_id_that_is_none_writes_nothing(call, service, rig):
     ("run: {log: run.mcap}\n", 403), ("profile: /etc/passwd\n", 403), ("letterhead: ../letterhead.yaml\n", 403),
     ("drive_data: {torque_calibration: ../c.json}\n", 403), ("name: x\nallow_reverse: true\n", 403),
     ("service: {motion: watched}\n", 403), ("limits: 3\n", 422), ("name: [", 422), ("accept_no_watchdog: true\n", 422)])
-def test_a_file_that_may_not_be_writes_nothing(call, service, text, code):
+def test_an_invalid_file_writes_nothing(call, service, text, code):
     call("POST", "/rigs", code, json={"id": "new", "text": text})
     assert not (service.supervisor.rigs.folder / "new.yaml").exists()
 
 
-def test_without_a_folder_of_rigs_the_way_out_is_named(tmp_path):
+def test_without_a_folder_of_rigs_the_remedy_is_named(tmp_path):
     found = Service(tmp_path / "data", None)
     with pytest.raises(Exception, match="--rigs DIR"):
         found.supervisor.add_rig("new", "name: x\n", "anna")
@@ -249,7 +249,7 @@ def test_no_rig_is_checked_while_a_real_shaft_may_turn(call, service, monkeypatc
 
 
 def test_the_check_is_that_of_the_command_line(monkeypatch, tmp_path):
-    """A check that failed is a result: the exit code is 4 then. Without findings, the reason is named."""
+    """A failed check is a result with exit code 4. Without findings, the message names the reason."""
     failed = {"grade": "bad", "name": "identity", "said": "another drive", "do": "choose its profile"}
     reply = SimpleNamespace(returncode=4, stdout=json.dumps({"checks": [failed], "exit_code": 4}), stderr="")
     seen = []
@@ -266,7 +266,7 @@ def test_the_check_is_that_of_the_command_line(monkeypatch, tmp_path):
 @pytest.mark.parametrize("reply", [
     subprocess.TimeoutExpired("tdhil", 1.0), SimpleNamespace(returncode=5, stdout="", stderr="no drive answers"),
     SimpleNamespace(returncode=5, stdout='{"error": {"message": "no drive answers"}}', stderr="")])
-def test_a_scan_without_a_reply_says_why(monkeypatch, reply):
+def test_a_scan_without_a_reply_gives_the_reason(monkeypatch, reply):
     def run(command, **how):
         if isinstance(reply, Exception):
             raise reply

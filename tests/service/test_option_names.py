@@ -1,4 +1,4 @@
-"""No page names an option of the command line: each text that a browser shows has the label of the option's field."""
+"""Pages name no option of the command line: texts in the browser have the label of the field instead."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ OF_THE_TERMINAL = {
     "tdhil/session/speed_calibration.py": "tdhil calibrate speed",
     "tdhil/session/stored_calibration.py": "the file of a calibration",
 }
-"""Modules with options that no page has, each with its reason. Those of `ELSEWHERE` are of the terminal, too."""
+"""Modules with options that no page has, each with its reason. Those of `ELSEWHERE` also belong to the terminal."""
 
 
 def texts_of(path: Path) -> Iterator[str]:
@@ -75,7 +75,7 @@ def texts_with_flags() -> list[tuple[str, str]]:
 
 
 def flags_of_pages() -> set[str]:
-    """Return the options whose field a template marks by itself."""
+    """Return the options whose field a template marks directly."""
     return set(re.findall(r'data-flag="(--[a-z-]+)"', "".join(path.read_text("utf-8") for path in TEMPLATES)))
 
 
@@ -95,7 +95,7 @@ def test_the_name_is_the_label_else_the_key_in_the_rig_s_file_else_a_command(tag
     for one in (*OPTIONS, *OF_A_TRACE, *OF_EVIDENCE):
         if one.label and one.flag != OPTION["excitation"].flag:
             assert names[one.flag] == f"“{language.word(one.label)}”"
-    assert names["--excitation"] == f"“{language.word('Motion')}”"            # that of a run, not that of a trace
+    assert names["--excitation"] == f"“{language.word('Motion')}”"            # the label of a run, not that of a trace
     assert {"en": "“modbus.unit” (rig's file)", "de": "“modbus.unit” (Datei der Anlage)"}[tag] == names["--unit"]
     assert (names["--yes"], names["--columns"]) == ("“tdhil identify --yes”", "“tdhil replay --columns”")
     assert set(keys_by_flag()) <= names.keys()
@@ -109,7 +109,7 @@ def replaced(tag: str, *texts: str) -> list[object]:
 
 @pytest.mark.heavy
 def test_no_text_of_a_page_keeps_an_option():
-    """Of each room below the pages, as a page shows it."""
+    """The check covers each room below the pages, in the form shown on a page."""
     known, own = languages()["en"].labels(), flags_of_pages()
     texts = [text for _, text in texts_with_flags() if set(FLAG.findall(COMMAND.sub("", text))) <= known.keys() - own]
     shown = [str(one) for one in replaced("en", *texts)]
@@ -128,12 +128,12 @@ def test_a_command_stays_and_an_unknown_option_too():
         "Measure it with tdhil identify --impedance, or lower “Control cycles per second”", *texts[4:]]
     german = ("Give “Längste Dauer der Stufe 5, Minuten” 146s or more, not --max-times",
               "add “tdhil identify --yes” or “--x”")
-    assert replaced("de", texts[0], "add --yes or “--x”", *german) == [*german, *german]      # once and again
+    assert replaced("de", texts[0], "add --yes or “--x”", *german) == [*german, *german]      # repeated calls
 
 
 @pytest.mark.heavy
 def test_every_refusal_of_a_request_is_shown_without_an_option(client, service, monkeypatch):
-    """Of a start, a plan, a rehearsal, a calibration and an acceptance, in each language."""
+    """The requests are a start, a plan, a rehearsal, a calibration and an acceptance, in each language."""
     run = service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     service.wait(run, "done")
     monkeypatch.setattr(service.supervisor, "work", lambda what, run, asked: WORK[what](asked))
@@ -152,7 +152,7 @@ def test_every_refusal_of_a_request_is_shown_without_an_option(client, service, 
     found = [(path, body, client.post(f"/api/v1/{path}", json=body)) for path, body in sent]
     assert [(path, body) for path, body, answer in found if answer.status_code < 400] == []
     documents = [answer.json() for _, _, answer in found]
-    assert any("--max-time" in one["error"]["message"] for one in documents)       # the API's own text has it
+    assert any("--max-time" in one["error"]["message"] for one in documents)       # the text of the API has it
     said = [text for one in documents for text in (one["error"]["message"], *(
         wrong["message"] for wrong in one.get("fields") or ()))]
     for tag in languages():

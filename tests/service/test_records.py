@@ -1,4 +1,4 @@
-"""What becomes of an ended run's records: tags, operator and note are edited, a run is archived or deleted, audited."""
+"""Records of an ended run: edits of tags, operator and note, archive and deletion, with audit entries."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def noted(service, what):
 # -- tags, operator, note
 
 
-def test_tags_operator_and_note_are_edited_later_and_the_audit_says_by_whom_from_what_to_what(call, service):
+def test_tags_operator_and_note_are_edited_later_with_user_and_values_in_the_audit(call, service):
     run = ended(call, service)
     folder = service.store.place(run)
     recorded = {name: (folder / name).read_bytes() for name in ("run.mcap", "request.json", "result.json")}
@@ -64,7 +64,7 @@ def test_tags_operator_and_note_are_edited_later_and_the_audit_says_by_whom_from
     assert call("POST", f"/runs/{run}/annotations", 200, json={"note": "", "tags": []})["note"] == ""
 
 
-def test_every_wrong_annotation_is_said_at_its_field(call, service):
+def test_every_wrong_annotation_is_reported_at_its_field(call, service):
     run = ended(call, service)
     sent = {"tags": ["a,b"], "operator": "x" * 501, "note": "y" * 501}
     found = call("POST", f"/runs/{run}/annotations", 422, json=sent)
@@ -76,12 +76,12 @@ def test_every_wrong_annotation_is_said_at_its_field(call, service):
 @pytest.mark.parametrize(("given", "kept"), [
     ((" a ", "A", "b\tc", ""), ("a", "b c")), (("Öl", "ÖL", "O\u0308l"), ("Öl",)), ((), ()),
 ])
-def test_a_tag_is_one_however_it_is_written(given, kept):
+def test_spellings_of_a_tag_are_one_tag(given, kept):
     assert tags_of(given) == kept
 
 
 @pytest.mark.parametrize("given", [["a,b"], ["x" * 41], [str(number) for number in range(21)]])
-def test_what_is_no_tag_is_refused(given):
+def test_an_invalid_tag_is_refused(given):
     with pytest.raises(ValueError, match="tag"):
         tags_of(given)
 
@@ -102,7 +102,7 @@ def test_without_an_audit_entry_nothing_is_changed(call, service, monkeypatch, n
     assert service.store.place(run).is_dir()
 
 
-def test_the_index_is_made_again_with_annotations_and_a_broken_file_is_none(tmp_path):
+def test_the_index_is_rebuilt_with_annotations_and_a_damaged_file_is_ignored(tmp_path):
     store = Store(tmp_path)
     store.prepare()
     runs = [store.new_id() for _ in range(3)]
@@ -208,7 +208,7 @@ def test_a_person_signs_the_verdict_and_the_log_once_and_the_audit_has_it(call, 
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("verdict", ["fail", "cannot tell"])
-def test_what_is_no_pass_is_signed_with_a_remark_only(call, service, verdict):
+def test_a_verdict_other_than_pass_is_signed_with_a_remark_only(call, service, verdict):
     run, sent = accepted(call, service, verdict)
     found = call("POST", f"/runs/{run}/acceptance", 422, json={**sent, "name": " ", "remark": " "})
     assert [(one["option"], verdict in one["message"]) for one in found["fields"]] == [
@@ -218,7 +218,7 @@ def test_what_is_no_pass_is_signed_with_a_remark_only(call, service, verdict):
 
 
 @pytest.mark.heavy
-def test_another_verdict_or_log_than_the_person_saw_is_refused_in_words(call, service):
+def test_a_signature_for_another_verdict_or_log_than_shown_is_refused(call, service):
     run, sent = accepted(call, service, "fail")
     for other, words in (({"verdict": "pass"}, "the verdict is fail, not pass"),
                          ({"log_sha256": "0" * 64}, "not the one that the page showed")):
@@ -283,7 +283,7 @@ def test_customer_order_and_place_are_edited_later_and_make_the_report_outdated(
     assert [one["option"] for one in long["fields"]] == ["order_number"]
 
 
-def test_an_edited_text_stands_in_the_report_with_what_was_recorded():
+def test_an_edited_text_is_in_the_report_with_the_recorded_one():
     noted = Annotations().edited({"operator": "Anna"}, "local", "2026-05-01T12:30:00.000Z", operator="Bert", tags=["x"])
     shown = noted.shown_on({"operator": "Anna", "note": None})
     assert (shown["operator"], shown["note"]) == ("Bert", None)
@@ -345,7 +345,7 @@ def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path,
 # -- deletion
 
 
-def test_a_run_is_deleted_by_its_typed_id_with_its_files_alone_and_the_audit_keeps_it(call, service):
+def test_a_run_is_deleted_by_its_typed_id_with_its_own_files_and_an_audit_entry(call, service):
     run, other = ended(call, service), ended(call, service)
     folder = service.store.place(run)
     (folder / "replays").mkdir()
@@ -366,7 +366,7 @@ def test_a_run_is_deleted_by_its_typed_id_with_its_files_alone_and_the_audit_kee
     (entry,) = noted(service, "run deleted")
     assert (entry.run, entry.rig, entry.details["log_sha256"]) == (run, "a", digest)
     assert entry.details["files"] == found["files"] and service.audit.verify() is None
-    assert not [one for one in service.said if run in one]              # no index entry is tried again for ever
+    assert not [one for one in service.said if run in one]              # no index entry is retried without end
 
 
 def test_a_deleted_run_is_in_no_list_also_before_the_index_is_written(call, service, monkeypatch):
@@ -380,7 +380,7 @@ def test_a_deleted_run_is_in_no_list_also_before_the_index_is_written(call, serv
 
 
 @pytest.mark.heavy
-def test_what_moves_or_is_referred_to_is_not_deleted(call, service, rigs):
+def test_a_moving_or_referenced_run_is_not_deleted(call, service, rigs):
     moving = call.start("a", "hold")["id"]
     service.wait(moving, "moving")
     for path, sent in (("delete", {"confirm": moving}), ("archive", {"archived": True})):
@@ -431,7 +431,7 @@ def test_a_run_that_is_replayed_is_kept_until_that_has_ended(call, service):
 
 
 def test_a_search_reads_the_index_and_no_file_of_a_run(tmp_path, monkeypatch):
-    """So ten thousand runs are searched in less than 0.2 s: `benchmarks/many_runs.py` measures it."""
+    """`benchmarks/many_runs.py` measures the time of a search in ten thousand runs: less than 0.2 s."""
     store = Store(tmp_path)
     store.prepare()
     run = store.new_id()

@@ -1,4 +1,4 @@
-"""What once was an internal error: texts that are none, numbers that are too long, a full disk, half-written files."""
+"""Former internal errors: invalid texts, numbers that are too long, a full disk, incomplete files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HALF = "\\ud800"
     ("/runs/x/annotations", f'{{"tags": ["{HALF}"]}}', "tags.0"),
     ("/rigs/real/file", f'{{"text": "{HALF}", "sha256": ""}}', "text"),
 ])
-def test_a_text_that_is_no_text_is_refused_with_its_field(call, service, path, body, field):
+def test_an_invalid_text_is_refused_with_its_field(call, service, path, body, field):
     found = call("POST", path, 422, content=body, headers={"content-type": "application/json"})["error"]
     assert found["where"] == field
     assert "surrogate" in found["what"]
@@ -44,7 +44,7 @@ def test_a_whole_pair_is_a_text(call, service):
     service.wait(run, "done")
 
 
-def test_whether_the_service_is_idle_is_said_beside_a_broken_run(call, service):
+def test_the_idle_state_of_the_service_is_reported_despite_a_damaged_run(call, service):
     said: list[str] = []
     run = call.start("a", "done")["id"]
     service.wait(run, "done")
@@ -74,7 +74,7 @@ def full(*_: Any, **__: Any) -> Any:
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("what", ["sign-off", "annotations", "rig file", "replay"])
-def test_a_full_disk_is_said_in_words(call, service, monkeypatch, what):
+def test_a_full_disk_is_reported_in_words(call, service, monkeypatch, what):
     run = call.start("a", "unseen" if what == "sign-off" else "done")["id"]
     service.wait(run, "stop_not_confirmed", "done")
     wait_for("its end", lambda: not service.supervisor.live())
@@ -135,7 +135,7 @@ def test_a_replay_whose_process_cannot_be_started_has_failed(call, service, monk
 
 
 def test_another_process_reads_whole_entries_while_lines_are_written(tmp_path, monkeypatch):
-    """A second `Audit`, as of `tdhil serve audit`, reads between line and head of the first."""
+    """A second `Audit`, as in `tdhil serve audit`, reads between the writes of line and head of the first."""
     (tmp_path / "audit").mkdir()
     writer, reader = Audit(tmp_path / "audit"), Audit(tmp_path / "audit")
     writer.note("anna", "one")
@@ -147,13 +147,13 @@ def test_another_process_reads_whole_entries_while_lines_are_written(tmp_path, m
         real(descriptor)
         if not between.is_set():
             between.set()
-            written.wait(1.0)              # only bounds how long the reader has for its mistake
+            written.wait(1.0)              # limits the time of the reader
 
     monkeypatch.setattr("tdhil.service.audit.os.fsync", slow)
     writing = threading.Thread(target=lambda: [writer.note("anna", str(number)) for number in range(2)])
     writing.start()
     assert between.wait(60.0)
-    # A half line, as a reader sees it between two writes of the system.
+    # A half line, as a reader may see it between two writes of the system.
     path = next((tmp_path / "audit").glob("*.jsonl"))
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])

@@ -1,4 +1,4 @@
-"""The table of routes and the modules of handlers agree: each declared route is served once, under its own name."""
+"""Agreement of route table and handler modules: each declared route is served once, under its own name."""
 
 from __future__ import annotations
 

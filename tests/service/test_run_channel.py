@@ -1,4 +1,4 @@
-"""The socket between web and run: who holds whom up, and what it costs to be heard."""
+"""Socket between web server and run: no client delays another one."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def threads() -> int:
 
 
 def silent(folder: Path) -> socket.socket:
-    """A client that connects and says nothing."""
+    """Connect a client that sends nothing."""
     found = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     found.connect(str(folder / SOCKET))
     return found
 
 
-def test_a_request_is_answered_by_a_thread_that_was_there(folder, listener, monkeypatch):
+def test_an_existing_thread_replies_to_a_request(folder, listener, monkeypatch):
     begun: list[str] = []
     monkeypatch.setattr(listener, "_begin", lambda: begun.append("a thread"))
     for number in range(20):
@@ -44,8 +44,8 @@ def test_a_request_is_answered_by_a_thread_that_was_there(folder, listener, monk
     assert begun == []
 
 
-def test_silent_clients_hold_nobody_up_and_their_threads_end(folder):
-    before = threads()                     # other tests' as well
+def test_silent_clients_delay_no_other_client_and_their_threads_end(folder):
+    before = threads()                     # including those of other tests
     silent_ones = [silent(folder) for _ in range(10)]
     for number in range(5):
         assert ask(folder, {"number": number}, timeout_s=HANGS_S) == {"heard": number}

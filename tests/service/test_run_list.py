@@ -1,4 +1,4 @@
-"""The list of runs by pages: filters, order and search reach every run, through the index and beside it."""
+"""List of runs by pages: filters, order and search cover every run, with and without the index."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def filled(tmp_path) -> tuple[Index, list[Summary]]:
 
 
 @pytest.mark.parametrize("wanted", FILTERS)
-def test_the_index_finds_what_the_filter_says_in_its_order(filled, wanted):
+def test_the_index_applies_filter_and_order(filled, wanted):
     index, every = filled
     for order in ORDERS:
         expected = order.sorted(one for one in every if wanted.contains(one))
@@ -89,8 +89,8 @@ def test_the_choices_are_all_values_that_occur(filled):
                                "tags": {"bearing", "checked", "Bear 2"}}
 
 
-def test_a_row_has_the_verdict_on_the_expected_values_of_its_result_also_in_an_index_of_before(tmp_path):
-    """An index that has no such column is made again from the files."""
+def test_a_row_has_the_acceptance_verdict_also_with_an_older_index(tmp_path):
+    """An index without this column is rebuilt from the files."""
     store = Store(tmp_path)
     store.prepare()
     for number, result in enumerate(({"acceptance": {"verdict": "fail"}}, {"acceptance": None}, {}, None)):
@@ -111,7 +111,7 @@ def test_a_row_has_the_verdict_on_the_expected_values_of_its_result_also_in_an_i
 
 @pytest.fixture
 def many(service, monkeypatch):
-    """A list of 40 runs, ten on a page. Some rows are ahead of the index, as those of live runs."""
+    """Return a list of 40 runs, ten per page. Some rows are newer than the index, like those of live runs."""
     monkeypatch.setattr(site_module, "PAGE_RUNS", 10)
     service.index.rebuild()
     found = rows()
@@ -172,7 +172,7 @@ def test_without_an_index_the_pages_come_from_the_files(call, service, monkeypat
 
 @pytest.mark.parametrize("query", ["page=0", "page=1.5", "page=1000000000", "sort=asked_by", "order=up", "state=asleep",
                                    "archived=perhaps", f"tag={'x' * 201}", f"acceptance={'x' * 201}"])
-def test_a_wrong_question_of_a_list_is_refused(call, query):
+def test_a_wrong_request_of_a_list_is_refused(call, query):
     call("GET", f"/runs/page?{query}", 422)
 
 
@@ -196,8 +196,8 @@ def played(service, *runs: dict[str, object]) -> list[Summary]:
     return found
 
 
-def test_a_history_says_which_results_of_runs_that_ended_early_it_leaves_out(call, service):
-    """By the rule of `tdhil trend`. They were left out in silence, though their pages show J."""
+def test_a_history_names_omitted_results_of_runs_that_ended_early(call, service):
+    """The rule is that of `tdhil trend`. They used to be omitted without a message, although their pages show J."""
     found = played(service, {"state": "done"}, {"state": "stopped"}, {"state": "failed"},
                    {"state": "failed", "rehearsal": True}, {"state": "done", "uploaded": True},
                    {"state": "stopped", "inertia_kg_m2": None})
@@ -209,7 +209,7 @@ def test_a_history_says_which_results_of_runs_that_ended_early_it_leaves_out(cal
 
 
 def test_rehearsals_displace_no_result_of_a_history_and_are_there_if_asked_for(call, service, monkeypatch):
-    """A rig's latest thousand runs were its history, also where all of them were rehearsals."""
+    """The latest thousand runs of a rig used to be its history, even if all of them were rehearsals."""
     monkeypatch.setattr(site_module, "TREND_RUNS", 2)
     first, *rehearsed = played(service, {}, *[{"rehearsal": True}] * 12)
     faults = {"drive_name": "Inverter", "rehearsed_faults": "torque-scale=1.1"}

@@ -1,4 +1,4 @@
-"""The process of a run itself, in this process: what it does before anything moves. No part is played by `fake_run`."""
+"""Process of a run, executed within this process: actions before motion, without `fake_run`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from drivers import DriveFault
-from tdhil.errors import ExitCode
+from tdhil.errors import ExitCode, LogBroken
 from tdhil.recording import read_run
 from tdhil.report import has_extra
 from tdhil.service.run_channel import STOP_FILE
@@ -24,7 +24,7 @@ SIMULATED = "run: {simulate: true}\n"
 
 
 class Asked:
-    """A run that was requested, and whose process has not begun."""
+    """Requested run whose process has not started."""
 
     def __init__(self, folder: Path, text: str, *, simulated: bool = True, motion: str = "attended",
                  **options: object) -> None:
@@ -48,7 +48,7 @@ class Asked:
 
 @pytest.fixture(autouse=True)
 def nicer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own_locks: None) -> list[int]:
-    """By how much it made itself nicer. It goes into its folder, too: neither is for the tests after it."""
+    """Return its changes of priority. Later tests keep their priority and working folder."""
     found: list[int] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("os.nice", found.append)
@@ -56,7 +56,7 @@ def nicer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own_locks: None) -> l
 
 
 @pytest.mark.parametrize(("left", "by"), [({"by": "anna", "at": now()}, "anna"), ({}, "somebody")])
-def test_a_stop_from_before_the_process_listened_is_the_first_thing_it_sees(tmp_path, left, by):
+def test_an_early_stop_request_is_handled_first(tmp_path, left, by):
     asked = Asked(tmp_path, SIMULATED, seed=7)
     write_json(asked.folder / STOP_FILE, left)
     assert asked.serve() == ExitCode.TERMINATED
@@ -84,8 +84,8 @@ def test_a_rig_s_file_that_was_changed_before_the_process_began_ends_it(tmp_path
 
 
 @pytest.mark.heavy
-def test_where_its_drive_is_is_kept_before_the_bus_is_opened(tmp_path, nobody_s_port):
-    """Nobody answers there, so that the run fails at its first word to the drive."""
+def test_the_connection_is_recorded_before_the_bus_is_opened(tmp_path, nobody_s_port):
+    """The address gives no reply, so the run fails at its first request to the drive."""
     asked = Asked(tmp_path, attended_rig(nobody_s_port), simulated=False)
     assert asked.serve() == ExitCode.REFUSED
     assert f"127.0.0.1:{nobody_s_port}" in asked.store.status(asked.run).error.message
@@ -98,7 +98,7 @@ def test_where_its_drive_is_is_kept_before_the_bus_is_opened(tmp_path, nobody_s_
 
 
 @pytest.mark.heavy
-def test_a_run_that_cannot_keep_where_its_drive_is_opens_no_bus(tmp_path, nobody_s_port, monkeypatch):
+def test_a_run_that_cannot_record_its_connection_opens_no_bus(tmp_path, nobody_s_port, monkeypatch):
     def full(path: Path, plain: object) -> None:
         if path.name == CONNECTION_FILE:
             raise OSError(28, "No space left on device")
@@ -110,7 +110,7 @@ def test_a_run_that_cannot_keep_where_its_drive_is_opens_no_bus(tmp_path, nobody
     assert not (asked.folder / "run.mcap").exists()
 
 
-def test_what_comes_over_its_socket_has_an_answer_each(tmp_path):
+def test_each_message_on_its_socket_has_a_reply(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED).folder)
     for asked, words in (({"do": "lease", "key": "x"}, "this run is not watched"),
                          ({"do": "confirm", "code": "1"}, "nothing to confirm")):
@@ -133,7 +133,7 @@ def test_a_simulated_run_from_its_request_to_its_result(tmp_path, nicer):
     asked = Asked(tmp_path, SIMULATED, seed=7, rate_hz=50.0)
     process = RunProcess(asked.folder)
     assert process.serve() == ExitCode.OK
-    assert process.watcher.log is not None                 # what a page says of itself gets into it
+    assert process.watcher.log is not None                 # it contains the message of the page
     assert asked.states[:3] == [State.REQUESTED, State.PREFLIGHT, State.MOVING]
     assert asked.states[-3:] == [State.STOPPING, State.IDENTIFYING, State.DONE]
     status = asked.store.status(asked.run)
@@ -142,7 +142,7 @@ def test_a_simulated_run_from_its_request_to_its_result(tmp_path, nicer):
     assert read_run(asked.folder / "run.mcap").complete
     assert (asked.folder / "report.html").exists() is has_extra()
     assert nicer == [NICE]
-    assert not (asked.folder / "plan.json").exists()       # nobody confirms it
+    assert not (asked.folder / "plan.json").exists()       # it is not confirmed
     assert json.loads((asked.folder / "row.json").read_bytes())["rig"] == "rig"
     assert result["verdict"] == "valid"
     assert (asked.folder / "run.mcap").exists()
@@ -150,8 +150,8 @@ def test_a_simulated_run_from_its_request_to_its_result(tmp_path, nicer):
 
 
 @pytest.mark.heavy
-def test_a_run_that_was_cut_short_shows_what_its_motion_did_show(tmp_path):
-    """The same result as `tdhil replay` of the log: a number from a part of the run is one, with its interval."""
+def test_an_aborted_run_has_the_result_of_its_motion(tmp_path):
+    """The result is that of `tdhil replay`: a part of a run gives a valid number with its interval."""
     asked = Asked(tmp_path, SIMULATED, seed=7, rate_hz=50.0, fault=["sto@acquire+160s"])
     assert RunProcess(asked.folder).serve() == ExitCode.DRIVE_FAULT
     status = asked.store.status(asked.run)
@@ -167,7 +167,7 @@ def test_a_run_that_was_cut_short_shows_what_its_motion_did_show(tmp_path):
 
 @pytest.mark.heavy
 def test_a_stop_file_reaches_a_run_of_the_service(tmp_path, rigs):
-    """As the web leaves it for a process that does not listen yet."""
+    """The web server writes it for a process that does not listen yet."""
     service = Service(tmp_path / "data", rigs, fake=False)
     begin = service.supervisor._begin
 
@@ -184,7 +184,7 @@ def test_a_stop_file_reaches_a_run_of_the_service(tmp_path, rigs):
     service.supervisor.close()
 
 
-def test_a_run_that_is_watched_no_more_is_stopped_by_nobody(tmp_path):
+def test_a_run_whose_lease_is_lost_stops_without_a_user(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
     assert process.watched
     process.operator_interface._unwatched(Watch("anna", now(), now(), "hidden", now()))
@@ -193,7 +193,7 @@ def test_a_run_that_is_watched_no_more_is_stopped_by_nobody(tmp_path):
     process.board.close()
 
 
-def test_a_lease_and_a_code_are_handed_on_as_they_came(tmp_path):
+def test_a_lease_and_a_code_are_passed_on_unchanged(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
     calls: list[object] = []
     watch = Watch("anna", now())
@@ -224,8 +224,43 @@ def test_a_run_that_ends_during_its_identification_has_failed(tmp_path, state):
     assert process.board.status.state is State.FAILED
 
 
-def test_a_run_whose_motion_is_over_needs_no_page_and_keeps_its_plan(tmp_path, monkeypatch):
-    """A page that goes while the result is made stops nothing: the lease has ended before."""
+def test_a_log_that_cannot_be_closed_does_not_lose_the_result(tmp_path, monkeypatch):
+    """The shaft is at standstill and J is known. The run ended as failed, without a result."""
+    document = {"verdict": "valid", "rehearsal": None, "inertia_kg_m2": None}
+
+    class Session:
+        rehearsal = None
+        log = SimpleNamespace(recording=lambda complete: SimpleNamespace(torque_scale_rel_sd=0.02))
+
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        def move(self, stop: object) -> SimpleNamespace:
+            process.board.to(State.MOVING)
+            process.board.to(State.STOPPING)
+            return SimpleNamespace(cause=None, stop=SimpleNamespace(confirmed=True))
+
+        def conclude(self) -> SimpleNamespace:
+            return SimpleNamespace(document=document, exit_code=ExitCode.OK)
+
+        def close(self) -> None:
+            raise LogBroken("no space is left", where="run.mcap")
+
+    monkeypatch.setattr("tdhil.session.RunSession", Session)
+    monkeypatch.setattr(RunProcess, "_row", lambda *_: None)
+    monkeypatch.setattr(RunProcess, "_report", lambda *_: None)
+    asked = Asked(tmp_path, SIMULATED)
+    process = RunProcess(asked.folder)
+    assert process._run() == ExitCode.PARTIAL
+    process.board.close()
+    assert read_json(asked.folder / "result.json") == document
+    status = asked.store.status(asked.run)
+    assert (status.state, status.verdict, status.exit_code) == (State.DONE, "valid", ExitCode.PARTIAL)
+    assert "no space is left" in status.error.what
+
+
+def test_after_the_motion_a_run_needs_no_page_and_keeps_its_plan(tmp_path, monkeypatch):
+    """The lease ends before the result is made, so a page that closes then stops nothing."""
     done: list[str] = []
 
     class Session:

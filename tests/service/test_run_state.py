@@ -1,4 +1,4 @@
-"""The states of a run: what may follow what, and that nothing else can."""
+"""States of a run: allowed and refused transitions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ states = st.sampled_from(sorted(State))
 
 
 @given(st.lists(states, max_size=12))
-def test_only_what_may_follow_follows_and_an_end_is_an_end(wanted):
+def test_only_allowed_transitions_occur_and_an_end_is_final(wanted):
     status = Status.begun("run", "rig", AT)
     for state in wanted:
         allowed = not status.ended and state in FOLLOWS[status.state]
@@ -57,14 +57,14 @@ def test_the_shaft_never_moves_unconfirmed_nor_ends_without_a_stop():
 
 
 @given(st.sampled_from(sorted(set(State) - ENDED)), st.sampled_from(sorted(ENDED)))
-def test_every_end_is_reached_from_wherever_a_run_was(state, end):
+def test_every_end_is_reached_from_any_state(state, end):
     status = Status("run", "rig", (Status.begun("run", "rig", AT).history[0],))
     for one in ("preflight", "awaiting_confirmation", "moving", "stopping", "identifying"):
         if status.state is state:
             break
         status = status.to(State(one), AT)
     if end is State.DONE and state in (State.REQUESTED, State.PREFLIGHT, State.AWAITING):
-        with pytest.raises(NotSo):         # nothing was moved: there is no result
+        with pytest.raises(NotSo):         # no motion and no result
             way_to(status, end, AT)
     elif end in (State.REFUSED, State.STOPPED) and state is State.IDENTIFYING:
         with pytest.raises(NotSo):
@@ -85,7 +85,7 @@ def test_an_exit_code_is_a_state(code, confirmed, state):
 @pytest.mark.parametrize(("code", "confirmed", "state"), [
     (3, True, "failed"), (9, None, "failed"), (143, True, "stopped"), (4, None, "refused"),
     (3, False, "stop_not_confirmed")])
-def test_what_was_cut_short_is_never_done(code, confirmed, state):
+def test_an_aborted_run_is_never_done(code, confirmed, state):
     assert _cut_short(code, confirmed) == state
 
 
@@ -93,7 +93,7 @@ def test_every_exit_code_has_its_end():
     assert all(end_of(code, stop_confirmed=True) in ENDED for code in ExitCode)
 
 
-def test_a_full_status_comes_back_from_json():
+def test_a_full_status_survives_a_round_trip_by_json():
     status = Status.begun("run", "rig", AT).to(
         State.PREFLIGHT, AT, preflight=(Check("identity", "a", "b", "ok", "1018h"),), simulated=True,
         confirmation=Confirmation("00", "this moves", AT), stop=Stop(asked=AT, by="local"),
@@ -109,7 +109,7 @@ def test_a_time_is_utc_to_the_millisecond():
 
 
 @pytest.mark.parametrize("next_step", ["Repeat it", f"{UNCHANGED}changed. Repeat it"])
-def test_a_full_disk_is_found_behind_an_error_which_keeps_what_happened_and_where(next_step):
+def test_a_full_disk_is_found_as_the_cause_of_an_error_that_keeps_its_text_and_place(next_step):
     error = LogError("no log", where="run.mcap", next_step=next_step)
     error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     found = disk_full(error)
@@ -119,7 +119,7 @@ def test_a_full_disk_is_found_behind_an_error_which_keeps_what_happened_and_wher
     assert disk_full(UsageError("no", where="--x", next_step="Do")) is None
 
 
-def test_a_stop_that_nobody_saw_blocks_until_it_is_signed_off():
+def test_an_unconfirmed_stop_blocks_until_it_is_signed_off():
     bad = Status.begun("bad", "rig", AT).to(State.STOP_NOT_CONFIRMED, AT)
     good = Status.begun("good", "rig", AT).to(State.REFUSED, AT)
     assert blocking((good, bad), ()) is bad

@@ -1,4 +1,4 @@
-"""What the API says of runs that are over: pictures, samples, many logs again; and what can be rehearsed."""
+"""Views of ended runs in the API: pictures, samples, fleets; and the possible rehearsals."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_samples_are_a_table(call, service, tmp_path, monkeypatch):
     assert call("GET", f"/runs/{run}/samples.csv", 200).text.startswith("time_s,")
 
 
-def test_what_can_be_rehearsed_is_taken_at_every_stage(call):
+def test_possible_rehearsals_are_accepted_at_every_stage(call):
     for bus in all_buses():
         faults = bus.faults()
         assert len({one.name for one in faults}) == len(faults) > 20
@@ -78,11 +78,11 @@ def test_what_can_be_rehearsed_is_taken_at_every_stage(call):
     call("GET", "/rigs/nobody/faults", 404)
 
 
-def test_the_rigs_to_play_with_are_simulated():
+def test_the_example_rigs_are_simulated():
     assert [(rig.problem, rig.simulated) for rig in Rigs(None).all()] == [("", True), ("", True)]
 
 
-def test_a_drive_that_somebody_holds_may_turn(service):
+def test_a_drive_in_use_may_turn(service):
     with hold("a drive of this test"):
         assert service.supervisor.turning()
 
@@ -98,9 +98,9 @@ def logs(tmp_path: Path) -> Path:
 
 
 def hurry(fleets: Fleets) -> None:
-    """It is nicer than all else: beside other tests it would take minutes, where a computer has little to spare."""
+    """Give the process normal priority: beside other tests it would take minutes on a small computer."""
     if (going := fleets._going) is None:
-        return                         # it has ended
+        return                         # its end
     process = going.process
     wait_for("its nice", lambda: process.poll() is not None or os.getpriority(os.PRIO_PROCESS, process.pid) == 19)
     with suppress(PermissionError, ProcessLookupError):
@@ -130,7 +130,7 @@ def test_many_logs_are_identified_again_and_wait_while_a_shaft_turns(call, servi
     assert call("GET", f"/fleets/{fleet}/rows?from=1", 200) == [trace]
     rows = list(csv.DictReader(call("GET", f"/fleets/{fleet}/fleet.csv", 200).text.splitlines()))
     assert [row["log"] for row in rows] == ["below/bad.mcap", "trace.csv"]
-    call("POST", "/fleets", 202, json={"folder": "logs", "tolerance": 0.01})       # again: it is all done
+    call("POST", "/fleets", 202, json={"folder": "logs", "tolerance": 0.01})       # again: all logs are complete
     hurry(fleets)
     wait_for("its end", lambda: fleets.get(fleet).state != "running")
     assert fleets.get(fleet).summary["done_before"] == 2
@@ -139,20 +139,20 @@ def test_many_logs_are_identified_again_and_wait_while_a_shaft_turns(call, servi
 
 
 @pytest.mark.heavy
-def test_a_fleet_that_is_ended_or_whose_web_dies_keeps_what_is_done(call, service, logs):
+def test_an_ended_fleet_or_one_of_a_dead_web_keeps_its_rows(call, service, logs):
     turns = [True]
     service.web.fleets = fleets = Fleets(service.store, {"logs": logs}, lambda: turns[0])
     fleet = fleets.ask("logs", "", {}, "local").id
     hurry(fleets)
     wait_for("logs that are found", lambda: fleets.get(fleet).total)
-    again = Fleets(service.store, {"logs": logs}, lambda: False)           # as the next web sees it
+    again = Fleets(service.store, {"logs": logs}, lambda: False)           # as read by the next web server
     assert again.get(fleet).state == "interrupted"
     call("POST", f"/fleets/{fleet}/stop", 200, json={})
     wait_for("its end", lambda: fleets.get(fleet).state == "interrupted")
 
 
 class PlayedFleet:
-    """The process of a fleet as the web sees it: a row, a rehearsal, and no end before the test allows it."""
+    """Process of a fleet for the web server: a row, a rehearsal, and no end before the test permits it."""
 
     def __init__(self, *_: object, **more: object) -> None:
         self.stdin, self.stdout, self.over = io.BytesIO(), self, threading.Event()

@@ -1,4 +1,4 @@
-"""`tdhil serve` as a process, with real simulated runs in stepped time: asked for, watched, killed, stopped."""
+"""`tdhil serve` as a process, with real simulated runs in stepped time: requested, watched, killed, stopped."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from tdhil.service.store import Store
 from tests.rigs import PATIENT_LIMITS, rig_file
 from tests.service.conftest import HANGS_S, folder_of_locks, wait_for
 
-QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
+QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the usual rate of the drive, to save computing time
 
 
 SERVE = """
 import sys
 from tdhil.session import drive_lock
-drive_lock.FOLDERS = (sys.argv.pop(1),)        # a replay waits for whoever holds a drive: not for those of other tests
+drive_lock.FOLDERS = (sys.argv.pop(1),)        # a replay waits for a drive in use, but not in other tests
 from tdhil.__main__ import console
 console()
 """
@@ -44,7 +44,7 @@ console()
 
 class Server:
     def __init__(self, data: Path, *more: str, descriptors: int | None = None, **client: Any) -> None:
-        """``descriptors``: its limit of open files."""
+        """Start a server. ``descriptors``: its limit of open files."""
         limit = () if descriptors is None else ("prlimit", f"--nofile={descriptors}:{descriptors}")
         self.log = (data.parent / "serve.txt").open("a+")
         start = self.log.seek(0, os.SEEK_END)
@@ -78,8 +78,8 @@ def served(data: Path, *more: str, descriptors: int | None = None, **client: Any
 
 
 @pytest.mark.heavy
-def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
-    """The web is killed while the shaft moves: nothing of the run is missing, and the next web finds it."""
+def test_a_run_outlives_its_web_and_gives_one_result(tmp_path):
+    """The web server is killed while the shaft moves. The run is complete, and the next web server finds it."""
     data = tmp_path / "data"
     with served(data) as first:
         assert [rig["id"] for rig in first.client.rigs()] == ["simulated-canopen", "simulated-modbus"]
@@ -130,7 +130,7 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
 
 @pytest.mark.heavy
 def test_half_requests_that_are_cut_off_leave_no_traceback(tmp_path):
-    """Each took two of them, 5 KB of log and the time of a stop that came after it."""
+    """Each half request used to write two tracebacks, 5 KB of log, and delayed a later stop."""
     with served(tmp_path / "data") as server:
         at = urlsplit(server.url)
         for _ in range(20):
@@ -148,9 +148,11 @@ def test_half_requests_that_are_cut_off_leave_no_traceback(tmp_path):
 
 @pytest.mark.heavy
 @pytest.mark.real_time
-def test_its_end_brakes_what_moves(tmp_path):
-    """SIGTERM, as of `systemctl stop`: the shaft is at rest before the service ends. A stop of a page comes to the
-    same."""
+def test_the_end_of_the_service_brakes_moving_shafts(tmp_path):
+    """With SIGTERM, as of `systemctl stop`, the shaft is at standstill before the service ends.
+
+    A stop from a page has the same effect.
+"""
     (tmp_path / "rigs").mkdir()
     rig_file(tmp_path / "rigs", "drive: modbus\nrun: {simulate: true}\n", PATIENT_LIMITS)
     with served(tmp_path / "data", "--rigs", str(tmp_path / "rigs")) as server:
@@ -168,7 +170,7 @@ def test_its_end_brakes_what_moves(tmp_path):
 @pytest.mark.heavy
 @pytest.mark.real_time
 def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_its_web_is_killed(tmp_path):
-    """The run's own process counts: there is no web any more that could tell it."""
+    """The process of the run counts the lease time itself, without a web server."""
     rigs, data = tmp_path / "rigs", tmp_path / "data"
     rigs.mkdir()
     rig_file(rigs, "rate_hz: 20\nrun: {simulate: true}\n", PATIENT_LIMITS, "service: {motion: watched}\n")
@@ -226,7 +228,7 @@ def test_another_host_without_login_and_tls_is_refused_in_words(host, capsys, tm
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
-def test_this_computer_is_not_as_long_as_it_has_no_users(host):
+def test_loopback_is_not_refused_without_users(host):
     require_way(host, tls=False, accounts=False)
     require_way(host, tls=True, accounts=False)
     require_way(host, tls=True, accounts=True)
@@ -251,7 +253,7 @@ def test_a_certificate_that_does_not_serve_is_refused_in_words(tls, tmp_path, ca
 
 @pytest.mark.heavy
 def test_with_users_it_is_reached_over_tls_with_a_token_alone(tls, tmp_path):
-    """As a process: a token over TLS may; none, another, an open line and a name that isn't ours may not."""
+    """A token over TLS is accepted. No token, another token, a plain connection and another host name are refused."""
     data = tmp_path / "data"
     accounts = AccountsFile(data)
     data.mkdir()
@@ -269,7 +271,7 @@ def test_with_users_it_is_reached_over_tls_with_a_token_alone(tls, tmp_path):
             server.client.audit()
         assert refused.value.status == 403
         with pytest.raises(CommunicationLost):
-            tdhil.Client(server.url, token=token).rigs()           # a certificate that nobody vouches for
+            tdhil.Client(server.url, token=token).rigs()           # an untrusted certificate
         with pytest.raises(CommunicationLost):
             tdhil.Client(server.url.replace("https", "http")).rigs()
         accounts.remove_token("notebook")
@@ -280,7 +282,7 @@ def known(client: tdhil.Client) -> bool:
     return bool(client.me()["roles"])
 
 
-def test_a_token_goes_over_tls_alone():
+def test_a_token_is_sent_over_tls_only():
     with pytest.raises(UsageError, match="over TLS only"):
         tdhil.Client("http://127.0.0.1:8420", token="tdhil_x")
     with pytest.raises(UsageError, match="can't be read as certificates"):
@@ -293,7 +295,7 @@ def test_a_missing_extra_is_installed_from_the_clone(monkeypatch):
         server.require_service()
 
 
-def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsys):
+def test_one_service_per_folder_and_an_existing_folder_of_rigs(tmp_path, capsys):
     from tdhil.service.server import _alone
 
     with _alone(tmp_path), pytest.raises(UsageError, match="another tdhil serve uses this folder"):
@@ -315,12 +317,12 @@ def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsy
     (["--tls-cert", "a.pem", "tokens", "list", "--data", "d"], "--tls-cert: has no effect with tokens"),
     (["--check-idle", "audit", "--data", "d"], "--check-idle: has no effect with audit"),
 ])
-def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, arguments, words):
+def test_a_refused_start_is_explained(tmp_path, capsys, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tdhil.service.server._uvicorn", lambda *_: pytest.fail("it served"))
     (tmp_path / "file").touch()
     (tmp_path / "taken" / "service.lock").mkdir(parents=True)
-    locks = tmp_path / "lock"              # a folder of its own: another test may hold a drive of this computer
+    locks = tmp_path / "lock"              # its own folder, since another test may lock a drive of this computer
     locks.mkdir()
     locks.chmod(0o1777)
     monkeypatch.setattr("tdhil.session.drive_lock.FOLDERS", (str(locks),))
@@ -330,14 +332,14 @@ def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, a
     assert not (tmp_path / "d").exists()
 
 
-def test_a_shaft_that_is_not_seen_at_rest_is_the_exit_code(tmp_path, capsys, monkeypatch):
+def test_an_unconfirmed_standstill_determines_the_exit_code(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tdhil.service.server._uvicorn",
                         lambda app, listening, brake, *_: brake.__self__.not_at_rest.append("R1"))
     assert main(["serve", "--port", "0", "--data", str(tmp_path / "data")]) == ExitCode.STOP_NOT_CONFIRMED
     assert "Standstill NOT confirmed: R1. Use the hard-wired emergency stop." in capsys.readouterr().err
 
 
-def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, capsys, monkeypatch):
+def test_a_file_without_a_valid_rig_id_is_reported_as_omitted(tmp_path, capsys, monkeypatch):
     for name in ("a.yaml", "rig 7.yaml", "b.yml", "notes.txt"):
         (tmp_path / name).write_text("run: {simulate: true}\n")
     monkeypatch.setattr("tdhil.service.server._uvicorn", lambda *_: None)
@@ -345,7 +347,7 @@ def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, cap
     assert "Ignored, because the name is not that of a rig file: b.yml, rig 7.yaml." in capsys.readouterr().err
 
 
-def test_a_client_says_what_the_service_says():
+def test_a_client_shows_the_message_of_the_service():
     with pytest.raises(CommunicationLost, match="Is tdhil serve running"):
         tdhil.Client("http://127.0.0.1:1").rigs()
 

@@ -1,4 +1,4 @@
-"""A Stop reaches its run and its drive: beside other slow stops, and whatever happens to the rig's file."""
+"""Stop that reaches its run and its drive: with other slow stops, and with any change of the rig's file."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def card(call: Checked, rig: str) -> dict[str, Any]:
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_run_is_stopped_on_its_card_whatever_happens_to_the_rig_s_file(client, call, service, change):
+def test_a_run_is_stopped_on_its_card_with_any_change_of_the_rig_s_file(client, call, service, change):
     run = call.start("a", "hold")["id"]
     service.wait(run, "moving")
     change(service.supervisor.rigs.get("a").path)
@@ -128,7 +128,7 @@ def test_a_run_is_stopped_on_its_card_whatever_happens_to_the_rig_s_file(client,
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_an_unconfirmed_stop_is_repeated_and_signed_off_whatever_happens_to_the_rig_s_file(
+def test_an_unconfirmed_stop_is_repeated_and_signed_off_with_any_change_of_the_rig_s_file(
     call, service, monkeypatch, change,
 ):
     run = unconfirmed(service, call)

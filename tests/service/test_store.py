@@ -1,4 +1,4 @@
-"""Files are the truth: written whole or not at all, the index made again from them, the audit unchanged."""
+"""Files as the primary data: complete writes, an index that can be rebuilt from them, and an unchanged audit."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def a_run(store: Store, rig: str = "a", end: State | None = State.REFUSED) -> st
     return run
 
 
-def test_how_a_run_ended_is_told_on_a_full_disk(store, monkeypatch):
-    """In the room that was kept for it; and where there is room again, in its file."""
+def test_the_end_of_a_run_is_recorded_on_a_full_disk(store, monkeypatch):
+    """The end is written into reserved space, and later into its file once there is space."""
     run = a_run(store, end=None)
     store.reserve(run)
     folder, status = store.place(run), store.status(run)
@@ -72,7 +72,7 @@ def a_run_without_room(store: Store) -> Status:
     return Status.begun(store.new_id(), "a", now())
 
 
-def test_a_run_comes_back_as_it_was_written(store):
+def test_a_run_is_read_as_written(store):
     run = a_run(store)
     assert store.ids() == [run]
     assert (store.request(run).options, store.status(run).state) == ({"seed": 7}, State.REFUSED)
@@ -93,12 +93,12 @@ def test_ids_sort_by_the_time_they_were_made_at(store):
     "", ".", "..", "../x", "20260101-000000-abcdef/../..", "20260101-000000-abcdef\0", "<script>", "/etc", "a" * 5000,
     "20260101-000000-abcdeg", "20260101-000000-abcdef\n",
 ])
-def test_a_name_that_is_no_id_names_no_folder(store, name):
+def test_an_invalid_id_names_no_folder(store, name):
     with pytest.raises(NotThere):
         store.place(name)
 
 
-def test_a_file_that_was_cut_is_an_interrupted_run_not_a_crash(store):
+def test_a_truncated_file_is_an_interrupted_run(store):
     run = a_run(store, end=None)
     (store.place(run) / "state.json").write_bytes(b'{"id": "')
     assert store.status(run).state is State.INTERRUPTED
@@ -131,7 +131,7 @@ def test_the_key_of_a_deleted_run_finds_it_for_its_user_and_rig_alone(store):
     assert store.deleted_with_key("a", "k", "otto") is store.deleted_with_key("b", "k", "anna") is None
 
 
-def test_a_deleted_index_is_made_again_the_same(store):
+def test_a_deleted_index_is_rebuilt_identically(store):
     index = Index(store)
     for rig, end in (("a", State.REFUSED), ("b", State.FAILED), ("a", State.STOPPED)):
         index.put(store.summary(a_run(store, rig, end)))
@@ -152,7 +152,7 @@ def test_a_deleted_index_is_made_again_the_same(store):
     ("'; drop", 0),
 ])
 def test_a_search_finds_each_word_in_any_text_of_a_run(store, text, expected):
-    """Index and files agree, in upper and lower case; a text of SQL or with its wildcards is only a text."""
+    """Index and files agree, in upper and lower case. SQL and its wildcards are plain text."""
     index = Index(store)
     options = {"operator": "Hans", "note": "after repair, Ölmühle"}
     for rig, said in (("b", options), ("a", {})):
@@ -164,7 +164,7 @@ def test_a_search_finds_each_word_in_any_text_of_a_run(store, text, expected):
 
 
 def test_a_rehearsal_is_marked_in_the_list_of_runs(store):
-    """A fault of the simulated drive changes the result: the list, and what lives on it, can tell."""
+    """A fault of the simulated drive changes the result, so the list and its users need the mark."""
     request = replace(store.request(a_run(store)), options={"fault": ["torque-scale=1.1"]})
     assert summary_of(request, store.status(request.id), None).rehearsal
     index = Index(store)
@@ -173,7 +173,7 @@ def test_a_rehearsal_is_marked_in_the_list_of_runs(store):
 
 
 def test_a_rebuild_holds_its_lock_for_one_batch_only(store, monkeypatch):
-    """The files are read without the lock: a list asked for meanwhile waits for no more than one batch."""
+    """The files are read without the lock, so another reader waits for at most one batch."""
     monkeypatch.setattr(store_module, "BATCH", 2)
     for _ in range(5):
         a_run(store)
@@ -193,7 +193,7 @@ def test_a_rebuild_holds_its_lock_for_one_batch_only(store, monkeypatch):
     assert index.wait_until_made(0.0)
 
 
-def test_what_changes_during_a_rebuild_is_not_overwritten(store, monkeypatch):
+def test_changes_during_a_rebuild_are_not_overwritten(store, monkeypatch):
     runs = [a_run(store) for _ in range(3)]
     index, read = Index(store), store.summary
     index.rebuild()
@@ -223,7 +223,7 @@ def test_a_file_that_is_no_index_is_replaced_by_a_rebuild(store):
     assert index.rebuild() == 1 and [one.id for one in index.find()] == [run]
 
 
-def test_it_has_a_rollback_journal(store):
+def test_the_index_has_a_rollback_journal(store):
     Index(store).rebuild()
     with sqlite3.connect(store.folder / "index.sqlite") as base:
         assert base.execute("pragma journal_mode").fetchone() == ("delete",)
@@ -251,7 +251,7 @@ def only_file(audit: Audit) -> Path:
     return path
 
 
-def test_an_untouched_chain_holds_and_goes_on(store, audit):
+def test_an_unchanged_chain_is_valid_and_continues(store, audit):
     assert audit.verify() is None
     again = Audit(store.folder / "audit")
     again.note("local", "stopped")
@@ -276,13 +276,13 @@ def test_one_changed_byte_anywhere_is_found(audit):
     lambda lines: [*lines, lines[-1]], lambda lines: [lines[1], lines[0], *lines[2:]],
     lambda lines: [*lines[:-1], lines[-1].replace(b'": ', b'":', 1)], lambda lines: [],
 ])
-def test_lines_taken_out_put_in_or_moved_are_found(audit, change):
+def test_removed_added_or_moved_lines_are_found(audit, change):
     path = only_file(audit)
     path.write_bytes(b"".join(change(path.read_bytes().splitlines(keepends=True))))
     assert audit.verify() is not None
 
 
-def test_killed_between_line_and_head_it_still_holds(store, audit):
+def test_after_a_kill_between_line_and_head_it_is_still_valid(store, audit):
     head = (store.folder / "audit" / "head.json").read_bytes()
     audit.note("local", "asked")
     (store.folder / "audit" / "head.json").write_bytes(head)
@@ -292,7 +292,7 @@ def test_killed_between_line_and_head_it_still_holds(store, audit):
     assert again.verify() is None
 
 
-def test_many_threads_make_one_chain(store):
+def test_many_threads_write_one_chain(store):
     audit = Audit(store.folder / "audit")
     threads = [threading.Thread(target=lambda: [audit.note("local", "x") for _ in range(5)]) for _ in range(4)]
     for thread in threads:
@@ -303,8 +303,8 @@ def test_many_threads_make_one_chain(store):
     assert len(list(audit.entries())) == 20
 
 
-def test_a_run_of_which_nothing_can_be_known_is_not_given_up_for_dead(tmp_path, monkeypatch):
-    """No descriptor is left in the web's process, say."""
+def test_a_run_of_unknown_state_is_not_declared_dead(tmp_path, monkeypatch):
+    """An example is a web process without free descriptors."""
     assert not lives(tmp_path)
     os.close(take_life(tmp_path))
     assert not lives(tmp_path)
@@ -316,7 +316,7 @@ def test_a_run_of_which_nothing_can_be_known_is_not_given_up_for_dead(tmp_path, 
     assert lives(tmp_path)
 
 
-# -- the audit's key: what is found by it, and what a head that is kept elsewhere finds
+# -- the key of the audit, and a head that is kept elsewhere
 
 
 def lines_of(audit: Audit) -> list[bytes]:
@@ -324,7 +324,7 @@ def lines_of(audit: Audit) -> list[bytes]:
 
 
 def fabricated(last: bytes, number: int, before: str) -> bytes:
-    """A line such as somebody without the key would write, with a plain hash."""
+    """Return a forged line with a plain hash, made without the key."""
     plain = {**json.loads(last), "number": number, "before": before, "who": "anna"}
     plain.pop("hash", None)
     digest = hashlib.sha256(json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()).hexdigest()
@@ -387,8 +387,8 @@ def a_head_without_its_seal(audit: Audit) -> None:
     all_of_it_deleted, the_key_deleted, the_key_another, an_old_head_alone, a_head_without_its_seal,
 ])
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_what_is_done_to_the_chain_without_its_key_is_found_for_good(audit, attack, goes_on):
-    """Also after the service has gone on: nothing that it writes makes a broken chain hold again."""
+def test_a_change_of_the_chain_without_its_key_is_found_permanently(audit, attack, goes_on):
+    """Later lines of the service do not make a broken chain valid again."""
     attack(audit)
     again = Audit(audit._folder)
     assert again.verify() is not None
@@ -397,13 +397,13 @@ def test_what_is_done_to_the_chain_without_its_key_is_found_for_good(audit, atta
             for _ in range(3):
                 again.note("local", "asked")
         if attack in (an_old_head_alone, a_head_without_its_seal):
-            assert again.verify() is None      # its lines were never touched, and it has a head again
+            assert again.verify() is None      # its lines are unchanged, and it has a head again
         else:
             assert again.verify() is not None
             assert Audit(audit._folder).verify() is not None
 
 
-def test_the_key_is_for_nobody_else_and_made_once(store, audit):
+def test_the_key_is_private_and_made_once(store, audit):
     path = store.folder / KEY_FILE
     assert path.stat().st_mode & 0o777 == 0o600
     key = json.loads(path.read_bytes())["key"]
@@ -412,7 +412,7 @@ def test_the_key_is_for_nobody_else_and_made_once(store, audit):
     assert key not in "".join(one.read_text() for one in (store.folder / "audit").iterdir())
 
 
-def test_killed_between_head_and_anchor_it_still_holds(store, audit):
+def test_after_a_kill_between_head_and_anchor_it_is_still_valid(store, audit):
     kept = (store.folder / KEY_FILE).read_bytes()
     audit.note("local", "asked")
     (store.folder / KEY_FILE).write_bytes(kept)
@@ -431,16 +431,16 @@ def test_a_kept_head_finds_another_chain_with_another_key(store, audit):
     all_of_it_deleted(audit)
     the_key_deleted(audit)
     other = Audit(store.folder / "audit")
-    assert other.verify() is None                      # nothing here shows it …
+    assert other.verify() is None                      # the chain itself does not show it …
     for _ in range(14):
         other.note("local", "asked")
     assert other.verify() is None
-    assert "line 12 differs from the exported head" in other.verify(kept).why      # … but what was kept elsewhere
+    assert "line 12 differs from the exported head" in other.verify(kept).why      # … but the exported head does
     with pytest.raises(UsageError):
         ChainHead.of("12")
 
 
-def test_a_chain_from_before_there_was_a_key_is_taken_as_it_is_and_sealed_from_then_on(store):
+def test_a_chain_without_a_key_is_accepted_and_sealed_from_then_on(store):
     folder, before, lines = store.folder / "audit", "0" * 64, []
     for number in range(1, 4):
         plain = {"number": number, "at": now(), "who": "local", "what": "asked", "run": None, "rig": None,
@@ -468,7 +468,7 @@ def test_a_chain_from_before_there_was_a_key_is_taken_as_it_is_and_sealed_from_t
         path.write_bytes(data)
 
 
-def test_the_key_is_there_before_the_first_line(store):
+def test_the_key_exists_before_the_first_line(store):
     audit = Audit(store.folder / "audit")
     audit.begin()
     assert (store.folder / KEY_FILE).exists()
@@ -507,7 +507,7 @@ def test_the_audit_on_the_terminal(audit, capsys, tmp_path):
 
 @pytest.mark.parametrize(("options", "marks"), [({}, ", SIMULATED"), (
     {"fault": ["sto@hold"]}, ", SIMULATED, FAULT REHEARSAL")])
-def test_the_console_at_the_rig_marks_what_waits_for_its_code(tmp_path, monkeypatch, options, marks):
+def test_the_console_at_the_rig_marks_runs_that_wait_for_their_code(tmp_path, monkeypatch, options, marks):
     store, said = Store(tmp_path), []
     store.prepare()
     run = store.new_id()

@@ -1,4 +1,4 @@
-"""What the supervisor does beside each run: begin, find again, brake, and never take a lost run for one at rest."""
+"""Supervisor of runs: it starts, finds and brakes them, and never reports standstill of a lost run."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.service.conftest import FAKE, Service, wait_for
 
 
 def begun(service: Service, what: str = "hold", rig: str = "a", *states: str) -> str:
-    """A run that has come as far."""
+    """Return a run in this state."""
     run = service.supervisor.start_run(rig, {"note": what}, "anna").request.id
     service.wait(run, *(states or ("moving",)))
     return run
 
 
 def ended(service: Service, rig: str = "a", state: State = State.STOP_NOT_CONFIRMED) -> str:
-    """A run of before that ended so."""
+    """Return an earlier run with this end."""
     run = service.store.new_id()
     status = service.store.begin(StoredRequest(run, rig, "rig.yaml", "0" * 64, {}, "anna", now(), True, "never"))
     service.store.save(way_to(status.to(State.PREFLIGHT, now()).to(State.MOVING, now()), state, now(),
@@ -45,7 +45,7 @@ def lines(service: Service) -> list[tuple[str, str, str | None, str | None]]:
     return [(one.who, one.what, one.run, one.rig) for one in service.audit.entries()]
 
 
-def test_what_blocks_a_rig_and_what_lives_is_found_at_the_start(service, tmp_path, rigs):
+def test_blocking_and_live_runs_are_found_at_the_start(service, tmp_path, rigs):
     bad, good = ended(service), ended(service, "b", State.STOPPED)
     signed = ended(service, "real")
     service.store.sign_off(signed, "anna", "at rest")
@@ -79,12 +79,12 @@ def test_close_ends_its_threads_and_no_run(service):
     service.supervisor.close()
     assert not thread.is_alive()
     assert not any(one.is_alive() for one in service.supervisor._begun)
-    assert [one.what for one in service.audit.entries()] == ["asked", "asked"]     # all that was noted is written
+    assert [one.what for one in service.audit.entries()] == ["asked", "asked"]     # all notes are written
     assert service.store.status(run).state is State.MOVING
 
 
 @pytest.mark.heavy
-def test_a_service_that_brakes_begins_nothing_more(service):
+def test_a_service_that_brakes_starts_no_more_runs(service):
     service.supervisor.start()
     loose, run = begun(service, "loose"), begun(service, "hold", "b")
     assert service.supervisor.brake("the end")
@@ -96,12 +96,12 @@ def test_a_service_that_brakes_begins_nothing_more(service):
         begun(service, "hold", "b")
     service.said.clear()
     assert service.supervisor.brake("again")
-    assert service.said == []                                              # nothing moves: nothing is said
+    assert service.said == []                                              # no motion, no message
     assert service.supervisor.not_at_rest == [loose]
 
 
 @pytest.mark.heavy
-def test_a_service_that_waited_long_enough_says_what_still_lives(service):
+def test_after_its_time_out_a_service_reports_live_runs(service):
     service.supervisor.start()
     run = begun(service, "frozen")
     assert not service.supervisor.brake("the end", within_s=0.0)
@@ -128,7 +128,7 @@ def test_a_key_gives_its_run_for_the_same_request_of_the_same_user_and_rig(servi
     wait_for("the audit", lambda: sum(one.what == "asked" for one in service.audit.entries()) == 2)
 
 
-def test_a_run_of_a_rig_that_may_not_move_or_of_options_that_cannot_be_is_none(service):
+def test_no_run_starts_for_a_rig_that_may_not_move_or_with_impossible_options(service):
     for rig, options, wrong in (("never", {}, "can't be moved over HTTP"), ("broken", {}, "broken.yaml"),
                                 ("a", {"excitation": "nosuch"}, "excitation"), ("nosuch", {}, "does not exist")):
         with pytest.raises(Exception, match=wrong):
@@ -136,7 +136,7 @@ def test_a_run_of_a_rig_that_may_not_move_or_of_options_that_cannot_be_is_none(s
     assert service.store.ids() == []
 
 
-def test_what_was_requested_is_written_down(service):
+def test_the_request_is_recorded(service):
     service.supervisor.start()
     run = begun(service, "done", "a", "done")
     request, rig = service.store.request(run), service.supervisor.rigs.get("a")
@@ -163,7 +163,7 @@ def test_a_stop_reaches_a_process_that_does_not_listen_yet_by_its_file(service, 
 
 
 @pytest.mark.parametrize("dies", [False, True])
-def test_a_stop_that_reaches_nobody_says_so(service, monkeypatch, dies):
+def test_a_stop_without_a_recipient_is_reported(service, monkeypatch, dies):
     run = begun(service, "hold")
     sent: list[int] = []
 
@@ -185,7 +185,7 @@ def test_a_stop_that_reaches_nobody_says_so(service, monkeypatch, dies):
     service.wait(run, "stopped")
 
 
-def test_a_full_disk_keeps_no_stop_from_the_second_road(service, monkeypatch):
+def test_a_full_disk_does_not_prevent_the_second_way_of_a_stop(service, monkeypatch):
     run = begun(service, "deaf")
 
     def full(*_: Any) -> Any:
@@ -197,7 +197,7 @@ def test_a_full_disk_keeps_no_stop_from_the_second_road(service, monkeypatch):
     service.wait(run, "stopped")
 
 
-def test_a_code_for_nothing_is_refused_and_noted(service):
+def test_a_code_without_a_waiting_run_is_refused_and_recorded(service):
     service.supervisor.start()
     run = begun(service)
     with pytest.raises(Conflict, match="nothing to confirm"):
@@ -217,7 +217,7 @@ def test_a_code_for_nothing_is_refused_and_noted(service):
     service.wait(run, "stopped")
 
 
-def test_a_signature_is_for_a_stop_that_was_not_confirmed_alone(service):
+def test_a_sign_off_is_for_an_unconfirmed_stop_only(service):
     bad, good = ended(service), ended(service, "b", State.STOPPED)
     service.supervisor.start()
     with pytest.raises(Conflict, match="nothing to sign off: the run is stopped"):
@@ -232,7 +232,7 @@ def test_a_signature_is_for_a_stop_that_was_not_confirmed_alone(service):
 
 
 @pytest.mark.heavy
-def test_an_edit_waits_for_nobody_who_has_the_rig(service, monkeypatch, rigs):
+def test_an_edit_does_not_wait_for_the_owner_of_the_rig(service, monkeypatch, rigs):
     service.supervisor.start()
     rig = service.supervisor.rigs.get("real")
     text = rig.path.read_text()
@@ -264,7 +264,7 @@ def test_an_edit_waits_for_nobody_who_has_the_rig(service, monkeypatch, rigs):
 
 
 @pytest.mark.heavy
-def test_a_process_that_is_lost_is_looked_after_once_and_the_others_all_the_same(service, monkeypatch):
+def test_a_lost_process_is_handled_once_and_the_others_as_usual(service, monkeypatch):
     service.supervisor.start()
     run, other = begun(service), begun(service, "hold", "b")
     real, died = service.supervisor._died, []
@@ -279,7 +279,7 @@ def test_a_process_that_is_lost_is_looked_after_once_and_the_others_all_the_same
     os.kill(service.store.status(run).pid, signal.SIGKILL)
     wait_for("the loss", lambda: died)
     service.supervisor.stop(other, "anna")
-    service.wait(other, "stopped")                     # meanwhile
+    service.wait(other, "stopped")                     # in the meantime
     wait_for("its end", lambda: service.supervisor.live() == [run])
     going.set()
     service.wait(run, "interrupted")
@@ -292,7 +292,7 @@ def test_a_process_that_is_lost_is_looked_after_once_and_the_others_all_the_same
     assert all(child.poll() is not None for child in service.supervisor._children.values())
 
 
-def test_what_fails_at_one_run_keeps_nobody_from_the_others(service, monkeypatch):
+def test_a_failure_of_one_run_does_not_affect_the_others(service, monkeypatch):
     service.supervisor.start()
     run, other = begun(service), begun(service, "hold", "b")
     real = service.supervisor._look_at
@@ -311,7 +311,7 @@ def test_what_fails_at_one_run_keeps_nobody_from_the_others(service, monkeypatch
     service.supervisor.stop(run, "anna")
 
 
-def test_what_is_left_of_a_lost_run_is_its_result(service, monkeypatch):
+def test_the_data_of_a_lost_run_give_its_result(service, monkeypatch):
     service.supervisor.start()
     found: list[tuple[str, str]] = []
     monkeypatch.setattr(service.supervisor, "work", lambda what, run, asked: found.append((what, run)) or {
@@ -325,7 +325,7 @@ def test_what_is_left_of_a_lost_run_is_its_result(service, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_arithmetic_that_fails_says_why(service, monkeypatch):
+def test_a_failed_computation_gives_the_reason(service, monkeypatch):
     with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
     assert refused.value.reported.exit_code != 0
@@ -339,7 +339,7 @@ def test_arithmetic_that_fails_says_why(service, monkeypatch):
         service.supervisor.work("plan", None, {})
 
 
-def test_an_audit_or_an_index_that_cannot_be_written_is_said_and_holds_nothing_up(service, monkeypatch):
+def test_an_unwritable_audit_or_index_is_reported_and_delays_nothing(service, monkeypatch):
     def full(*_: Any, **__: Any) -> Any:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -380,8 +380,8 @@ def test_the_codes_of_runs_that_wait_are_shown_at_the_terminal_of_the_service(se
     assert run not in service.supervisor._console._shown
 
 
-def test_a_run_s_process_is_one_of_its_own(service):
-    """What ends the web's session ends no run; and its lock is handed on, so that it never looks dead."""
+def test_the_process_of_a_run_has_its_own_session(service):
+    """The end of the web server's session ends no run. The lock is inherited, so that the run never appears dead."""
     service.supervisor.start()
     run = begun(service)
     pid = service.store.status(run).pid
@@ -393,7 +393,7 @@ def test_a_run_s_process_is_one_of_its_own(service):
 
 @pytest.mark.parametrize("at", ["new_id", "begin"])
 @pytest.mark.parametrize(("number", "kind"), [(errno.ENOSPC, NoRoom), (errno.EDQUOT, NoRoom), (errno.EROFS, LogError)])
-def test_a_run_that_cannot_be_written_down_is_none(service, monkeypatch, at, number, kind):
+def test_a_run_that_cannot_be_recorded_does_not_start(service, monkeypatch, at, number, kind):
     def full(*_: Any) -> Any:
         raise OSError(number, os.strerror(number))
 
@@ -405,10 +405,10 @@ def test_a_run_that_cannot_be_written_down_is_none(service, monkeypatch, at, num
     assert service.supervisor.live() == []
 
 
-# -- threads that are there before they are needed
+# -- threads that exist before they are needed
 
 
-def test_jobs_are_done_in_order_in_a_thread_that_was_there_and_one_that_fails_is_told_of(monkeypatch):
+def test_jobs_are_done_in_order_in_an_existing_thread_and_failures_are_reported(monkeypatch):
     said: list[str] = []
     jobs = supervisor_module.Jobs("test", said.append)
     monkeypatch.setattr(threading.Thread, "start", lambda thread: pytest.fail("a thread was started"))
@@ -427,7 +427,7 @@ def test_jobs_are_done_in_order_in_a_thread_that_was_there_and_one_that_fails_is
 
 
 def test_a_stop_and_its_note_start_no_thread_and_wait_for_no_disk(service, monkeypatch):
-    """To start a thread takes long on a busy computer; the audit may wait for its disk as long as it likes."""
+    """The start of a thread takes long on a busy computer. The audit may wait for its disk without a limit."""
     service.supervisor.start()
     run = begun(service)
     written, real = threading.Event(), service.audit.note
@@ -441,8 +441,8 @@ def test_a_stop_and_its_note_start_no_thread_and_wait_for_no_disk(service, monke
     wait_for("the note", lambda: ("bert", "stop asked", run, "a") in lines(service))
 
 
-def test_what_changes_while_a_run_is_indexed_is_indexed_once_more(service, monkeypatch):
-    """And what is asked for ten times meanwhile is indexed once."""
+def test_a_change_during_indexing_is_indexed_once_more(service, monkeypatch):
+    """Ten requests during this time give one indexing."""
     run, begun_, go, puts = ended(service), threading.Event(), threading.Event(), []
 
     def put(summary: Any) -> None:
@@ -466,7 +466,7 @@ def test_what_changes_while_a_run_is_indexed_is_indexed_once_more(service, monke
     (8, b'{"same_drive": true}', False, "did NOT confirm"),
     (8, b'{"same_drive": false, "identity": "9,9"}', False, "another drive (9,9) replied"),
 ])
-def test_what_a_stop_s_process_ended_with_is_all_that_was_seen(monkeypatch, code, said, seen, words):
+def test_the_end_of_a_stop_process_determines_whether_standstill_was_seen(monkeypatch, code, said, seen, words):
     monkeypatch.setattr(supervisor_module.subprocess, "run",
                         lambda *_, **__: SimpleNamespace(returncode=code, stdout=said))
     found, text = supervisor_module._stop_seen(["stop"])
@@ -474,7 +474,7 @@ def test_what_a_stop_s_process_ended_with_is_all_that_was_seen(monkeypatch, code
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOENT, "no such program"), subprocess.TimeoutExpired("stop", 1.0)])
-def test_a_stop_s_process_that_never_ends_has_seen_nothing(monkeypatch, error):
+def test_a_stop_process_that_never_ends_confirms_nothing(monkeypatch, error):
     def fails(*_: Any, **__: Any) -> Any:
         raise error
 
@@ -483,7 +483,7 @@ def test_a_stop_s_process_that_never_ends_has_seen_nothing(monkeypatch, error):
     assert not found and text.startswith("tdhil stop: ")
 
 
-def test_a_drive_is_certainly_idle_where_nothing_of_this_computer_can_move_it(service, monkeypatch):
+def test_a_drive_is_idle_if_no_process_on_this_computer_can_move_it(service, monkeypatch):
     supervisor, rig = service.supervisor, service.supervisor.rigs.get("real")
     assert supervisor.certainly_idle(rig) is True
     assert supervisor.certainly_idle(supervisor.rigs.get("a")) is False        # simulated: there is no drive

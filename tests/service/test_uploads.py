@@ -1,4 +1,4 @@
-"""Uploads over HTTP: what is received, what is refused and leaves nothing, and the run that is made from it."""
+"""Uploads over HTTP: received files, refused files that leave no data, and the run from an upload."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def identify(call: Any, upload: str, **more: Any) -> Any:
 # -- from a file to a run
 
 
-def test_a_trace_becomes_a_run_that_has_ended_and_concerns_no_rig(call, service, work):
+def test_a_trace_becomes_an_ended_run_without_a_rig(call, service, work):
     upload = send(call, name="Umrichter 7.csv")
     assert (upload["kind"], upload["state"], upload["size_bytes"]) == ("trace", "waiting", len(TRACE))
     assert upload["sha256"] == hashlib.sha256(TRACE).hexdigest()
@@ -133,7 +133,7 @@ MOTION = {"motion_start_s": "0.5 s", "motion_period_s": 0.5, "motion_periods": 4
     ({"motion_period_s": -1, "motion_kind": "pulses"}, ["motion_period_s", "motion_kind"]),
     ({"excitation": "kind: sine"}, ["excitation"]),
 ])
-def test_the_fields_of_a_motion_are_checked_and_each_mistake_is_at_its_field(call, work, more, wrong):
+def test_the_fields_of_a_motion_are_checked_with_each_error_at_its_field(call, work, more, wrong):
     upload = send(call)["id"]
     found = call("POST", f"/uploads/{upload}/preview", 200, json={**MAPPING, **MOTION, **more})
     assert [one["option"] for one in found["wrong"]] == wrong
@@ -141,7 +141,7 @@ def test_the_fields_of_a_motion_are_checked_and_each_mistake_is_at_its_field(cal
     assert wrong or reading["excitation"] == more.get("motion_kind", "multisine")
 
 
-def test_what_failed_is_told_and_can_be_identified_again(call, work):
+def test_a_failure_is_reported_and_can_be_identified_again(call, work):
     upload = send(call)["id"]
     found = identify(call, upload, note="fails")
     assert (found["state"], found["run"], found["error"]["message"]) == ("failed", None, "no row")
@@ -161,14 +161,14 @@ def test_an_identification_waits_until_no_real_shaft_turns(call, service, work, 
     wait_for("its run", lambda: call("GET", f"/uploads/{upload}", 200)["run"])
 
 
-# -- what is refused, and leaves nothing
+# -- refusals, which leave no data
 
 
 @pytest.mark.parametrize(("data", "headers", "status", "said"), [
     (TRACE, {"Content-Type": "text/plain"}, 422, "must be the file itself"), (b"", {}, 422, "the file is empty"),
     (TRACE, {"Content-Length": str(2**40)}, 413, "larger than the limit"),
 ])
-def test_what_is_no_upload_is_refused(call, service, data, headers, status, said):
+def test_an_invalid_upload_is_refused(call, service, data, headers, status, said):
     assert said in send(call, data, expect=status, headers=headers)["error"]["what"]
     assert left(service) == []
 
@@ -219,7 +219,7 @@ def test_only_so_many_uploads_wait_and_a_deleted_one_makes_room(call, service):
 
 
 class Body:
-    """A request whose body comes as the test says."""
+    """Request with a body from the test."""
 
     def __init__(self, *parts: bytes | Exception | float) -> None:
         self._parts = parts
@@ -299,7 +299,7 @@ def test_a_hostile_name_is_escaped_on_the_page(call, client, work):
     (b"x\n1\n2\n", "no table"), (b"\x00\x01\x02" * 500, "neither text"), (b"\x89MCAP0\r\n", ""),
     (b"t_s;n_rpm;m_nm\n" + b"0;nan;nan\n" * 50, ""), (b"PK\x03\x04" + b"x" * 99, "spreadsheet"),
 ])
-def test_a_file_that_is_no_recording_says_so_in_its_preview(call, work, data, said):
+def test_the_preview_reports_a_file_that_is_no_recording(call, work, data, said):
     upload = send(call, data)["id"]
     found = call("POST", f"/uploads/{upload}/preview", 200, json={})
     problem = found["preview"]["problem"]
@@ -320,7 +320,7 @@ def test_a_log_has_its_own_motion_and_takes_no_options_of_a_trace(call, work):
     assert error["fields"][0]["option"] == "gear_ratio"
 
 
-# -- the whole way
+# -- the whole path
 
 
 @pytest.mark.heavy
@@ -357,7 +357,7 @@ def test_an_identified_trace_is_marked_as_uploaded_in_every_document(call, servi
 
 
 def test_a_preview_leaves_the_motion_of_a_running_identification_as_it_is(tmp_path, monkeypatch):
-    """The identification reads the trace after its motion was written; a preview of another form may come between."""
+    """The identification reads the trace after its motion is written. A preview of another form may come in between."""
     from tdhil import session
     from tdhil.service.upload_work import read_upload
 

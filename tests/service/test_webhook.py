@@ -1,4 +1,4 @@
-"""Messages on ended runs and changed rigs, to a server that the test plays."""
+"""Messages on ended runs and changed rigs, to a server of the test."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def trend(changes=(), drift=None):
 
 @pytest.fixture
 def listener():
-    """A server on a port of its own: ``got`` are (body, signature), ``statuses`` its next answers."""
+    """Server on its own port. ``got``: (body, signature). ``statuses``: its next replies."""
     class Listener(BaseHTTPRequestHandler):
         def do_POST(self):
             body = self.rfile.read(int(self.headers["content-length"]))
@@ -57,7 +57,7 @@ def address(server):
 def test_an_end_a_failure_and_a_change_are_sent_once(tmp_path, listener, monkeypatch):
     monkeypatch.setattr("tdhil.service.notifications.EVERY_S", 0.01)
     monkeypatch.setattr("tdhil.service.notifications.TRIES_S", (0.0, 0.0))
-    listener.statuses += [503]                                     # the first try fails
+    listener.statuses += [503]                                     # the first attempt fails
     secret = tmp_path / "secret"
     secret.write_text("hush\n")
     hook = Webhook.of(address(listener), {SECRET_FILE: str(secret)})

@@ -1,16 +1,38 @@
-"""Limits of a run: those of the rig, and a lower highest speed for one run."""
+"""Limits of a run: those of the rig, and a lower maximum speed for one run."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
 from drivers import PreflightRefused
+from sim_bus.params import load_rig
 from tdhil.cli.main import main
-from tdhil.config import simulated_default_rig
+from tdhil.config import parse_rig, simulated_default_rig
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session.task import bench_of, machine_limits
+from tdhil.session.task import bench_of, machine_limits, suited
+
+
+def string_plant():
+    return load_rig(Path(__file__).parents[2] / "examples" / "plant_string.yaml")
+
+
+def test_limits_for_a_simulated_string_keep_what_the_file_states():
+    rig = parse_rig("load: {kind: string}\nmake_up_torque_nm: 3000\ntorque_ramp_nm_s: 5\n", "rig.yaml")
+    bench = suited(rig, string_plant())
+    assert (bench.make_up_torque_nm, bench.torque_ramp_nm_s) == (3000.0, 5.0)
+    assert bench.limits.torque_nm < 3000.0
+
+
+def test_a_dry_run_plans_for_the_limits_of_the_run(capsys):
+    """It planned for the default rig: ±400 N·m, where the run has 4000."""
+    plant = Path(__file__).parents[2] / "examples" / "plant_string.yaml"
+    assert main(["identify", "--simulate", "--plant", str(plant), "--dry-run", "--json"]) == 0
+    limits = json.loads(capsys.readouterr().out)["limits"]
+    bench = suited(None, string_plant())
+    assert limits["torque_nm"] == bench.limits.torque_nm > 1000.0
 
 
 @pytest.mark.parametrize("simulated", [False, True])

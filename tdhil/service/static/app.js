@@ -706,7 +706,7 @@
         return;
       }
       byId("ended").hidden = !over;
-      byId("stop").disabled = over;
+      byId("stop").disabled = rests;
       byId("stop").closest(".stopbar").classList.toggle("past", rests);      // nothing is left to stop: only the times stay
       const confirm = status.state === "awaiting_confirmation" && status.confirmation;
       byId("confirm").hidden = !confirm;
@@ -756,6 +756,7 @@
     }
 
     byId("stop").addEventListener("click", async () => {
+      if (status && ENDED.includes(status.state)) { await stopRig({ id: status.rig, name: status.rig_name || status.rig }); return; }      // the run is over, its shaft may still turn
       asking = Date.now();
       stopTimes();
       const late = setTimeout(() => { undelivered = true; stopAlarm(); }, SILENT_MS);

@@ -1,4 +1,4 @@
-"""Fixtures of the pages in Chromium, before a service whose runs are played.
+"""Fixtures of the pages in Chromium, with a service whose runs are simulated by `fake_run`.
 
 Skipped where there is no Chromium (`TDHIL_CHROMIUM` names one, else the PATH) or no playwright (extra `browser`).
 """
@@ -35,7 +35,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any, served: Served) -> Iterator[Any]:
-    """A page that loads nothing from elsewhere, and whose script makes no mistake."""
+    """Page that loads no external resources, and whose script raises no errors."""
     context = browser.new_context(base_url=served.url)
     context.set_default_timeout(60_000)
     found = context.new_page()

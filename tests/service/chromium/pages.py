@@ -1,4 +1,4 @@
-"""A service on a port of its own, its pages, and a run whose results say everything that a page can show."""
+"""Service on its own port, its pages, and a run whose results contain everything that a page can show."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tests.service.conftest import Service, wait_for
 CHROMIUM = os.environ.get("TDHIL_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 IN_CHROMIUM = [
     pytest.mark.browser,
-    pytest.mark.real_time,         # a page that is silent for five seconds brakes its run
+    pytest.mark.real_time,         # a run brakes after five seconds of silence of its page
     pytest.mark.one_worker,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium, or TDHIL_CHROMIUM=PATH)"),
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
 ]
-"""Marks of each file of this folder."""
+"""Marks of every test file in this folder."""
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
 PAGES = ("/", "/new-rig", "/start/a", "/calibrate/a", "/rehearse/a", "/rigs/a", "/runs", "/upload", "/fleets", "/audit",
          "/docs", "/letterhead", "/rigs/a/file", "/start/watched", "/start/real")
@@ -41,7 +41,7 @@ PLAN = {
 
 
 class Served:
-    """The web of one service on a port of its own, in a thread; it can be ended."""
+    """Web server of one service on its own port, in a thread that can be ended."""
 
     def __init__(self, service: Service, cert: Path | None = None, key: Path | None = None) -> None:
         import uvicorn
@@ -73,7 +73,7 @@ def estimate(value: float, share: float = 0.01) -> dict[str, float]:
 
 
 def results(served: Served, run: str, monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
-    """Pages of results, with everything on them that there may be, called and said as badly as can be."""
+    """Return pages of results with every possible part, with hostile names and texts."""
     from tdhil.fleet import FleetRow
     from tdhil.fleet.table import write_table
 
@@ -131,7 +131,7 @@ def results(served: Served, run: str, monkeypatch: pytest.MonkeyPatch) -> tuple[
 
 
 def judge(served: Served, run: str) -> None:
-    """Give a run an acceptance that fails, the verdict on a rehearsal, stages and events, each with foreign text."""
+    """Add a failed acceptance, the verdict on a rehearsal, stages and events to a run, each with foreign text."""
     folder = served.service.store.place(run)
     rows = [{"name": "inertia", "label": "moment of inertia J", "unit": "kg·m²", "expected": 95.0, "tolerance": 1.0,
              "value": 104.0, "low": 100.0, "high": 108.0, "verdict": "fail", "text": HOSTILE},
@@ -156,7 +156,7 @@ def asks_with_a_checklist(served: Served) -> str:
 
 
 def second(served: Served, run: str) -> str:
-    """Another run of the rig."""
+    """Return another run of the rig."""
     other = served.service.supervisor.start_run(served.service.store.request(run).rig, {"note": "done"}, "local")
     served.service.wait(other.request.id, "done")
     return str(other.request.id)

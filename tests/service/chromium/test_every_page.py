@@ -1,4 +1,4 @@
-"""Each page in Chromium: foreign text stays text, everything fits a phone, and axe-core finds no serious fault."""
+"""Each page in Chromium: foreign text stays text, the page fits a phone, and axe-core finds no serious fault."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = IN_CHROMIUM
 
 
 @pytest.mark.heavy
-def test_what_comes_from_rigs_drives_and_logs_is_text_on_every_page(page, served, monkeypatch):
+def test_data_of_rigs_drives_and_logs_are_text_on_every_page(page, served, monkeypatch):
     run = served.service.supervisor.start_run("hostile", {"note": "done", "operator": HOSTILE}, "local").request.id
     served.service.wait(run, "done")
     paths = results(served, run, monkeypatch)
@@ -38,10 +38,10 @@ def test_what_comes_from_rigs_drives_and_logs_is_text_on_every_page(page, served
 
 
 @pytest.mark.heavy
-def test_every_page_fits_a_phone_and_can_be_read(browser, served, monkeypatch):
-    """No page is wider than 390 px; axe-core, where TDHIL_AXE names its file, finds no serious fault.
+def test_every_page_fits_a_phone_and_is_legible(browser, served, monkeypatch):
+    """Pages are at most 390 px wide; axe-core, if TDHIL_AXE names its file, finds no serious fault.
 
-    Of the dark colours it looks at the contrast only: all else is the same page.
+    With dark colours it checks the contrast only, since the rest of the page is the same.
     """
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")

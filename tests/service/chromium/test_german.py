@@ -1,4 +1,4 @@
-"""The pages in another language, in Chromium: no text is left in English, German fits a phone, a comma is a number."""
+"""Pages in another language in Chromium: no English text, German fits a phone, and a decimal comma is accepted."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DATA = {
     r"CANopen|Modbus|EtherCAT|RTU|TCP|UTC": "names of buses and zones",
     r"sto@hold": "a fault, as it is typed",
 }
-"""What a page shows in each language, with its reason."""
+"""Texts that a page shows in each language, with the reason."""
 LEFT = re.compile(rf"\b({'|'.join(DATA)})\b|\w*\d[\w.:-]*")
 TEXTS = """() => {
     const found = [], walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
@@ -48,7 +48,7 @@ TEXTS = """() => {
 
 @pytest.fixture
 def pseudo(tmp_path: Path, rigs: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """A service whose German is the English text between marks."""
+    """Service whose German texts are the English ones between marks."""
     marked = Language("de", "Deutsch", ",", {key: f"{FIRST}{where[0].text}{LAST}" for key, where in texts().items()})
     monkeypatch.setattr("tdhil.service.page_routes.languages", lambda: {**languages(), "de": marked})
     found = Served(Service(tmp_path / "data", rigs))
@@ -67,10 +67,10 @@ def german(browser: Any, served: Served, width: int = 1280) -> Any:
 
 
 def unmarked(text: str) -> str:
-    """What is left of a text without its marked parts and without data."""
+    """Return the rest of a text without its marked parts and data."""
     while (less := re.sub(f"{FIRST}[^{FIRST}{LAST}]*{LAST}", "", text)) != text:
         text = less
-    text = re.sub(f"^[^{FIRST}]*{LAST}|{FIRST}[^{LAST}]*$", "", text)          # a value stands within the text
+    text = re.sub(f"^[^{FIRST}]*{LAST}|{FIRST}[^{LAST}]*$", "", text)          # a value is within the text
     return LEFT.sub("", text.replace(HOSTILE, ""))
 
 
@@ -95,7 +95,7 @@ def test_a_page_in_another_language_has_no_english_text(browser, pseudo, monkeyp
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
 def test_every_german_page_fits_and_can_be_read(browser, served, monkeypatch, width):
-    """No page is wider than its window; axe-core, where TDHIL_AXE names its file, finds no serious fault."""
+    """Pages are not wider than their window; axe-core, if TDHIL_AXE names its file, finds no serious fault."""
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
     page, faults = german(browser, served, width), []

@@ -1,4 +1,4 @@
-"""J from the periods so far, on the page of a run in Chromium: figures, graph, and agreement with the result."""
+"""J from the periods so far, on the page of a run in Chromium: values, graph, and agreement with the result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAST = LiveInertia(1.6, 4, 0.95, "valid", "because", 104.2, 103.1, 105.3, 100.0,
 
 
 def played(served: Any, *found: LiveInertia) -> str:
-    """Begin a run, whose log has these intermediate results."""
+    """Begin a run whose log has these intermediate results."""
     run = begin(served)
     folder = served.service.store.place(run)
     with RunWriter(folder / "other.mcap", epoch_ns=10**18, block=True) as writer:
@@ -66,7 +66,7 @@ def test_j_so_far_can_be_read_at_each_time(page, served):
 
 @pytest.mark.heavy
 def test_the_last_value_is_the_one_of_the_result(page, served):
-    """The same numbers are shown with the same digits: live with the repeatability, and in the result's own key."""
+    """The page shows the same digits live with the repeatability, and for the key of the result."""
     run = played(served, FIRST, LAST)
     page.goto(f"/runs/{run}/live")
     now = page.locator("#inertia-now", has_text=SHOWN)
@@ -84,7 +84,7 @@ def test_one_period_is_written_in_the_singular(page, served):
 
 
 @pytest.mark.heavy
-def test_an_interval_without_a_number_says_why(page, served):
+def test_an_interval_without_a_number_gives_the_reason(page, served):
     run = played(served, LiveInertia(0.5, 2, 0.95, "not_identifiable", "2 periods leave the scatter open"))
     page.goto(f"/runs/{run}/live")
     page.locator("#inertia-said", has_text="2 periods leave the scatter open").wait_for()

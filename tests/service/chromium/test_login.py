@@ -1,4 +1,4 @@
-"""Login, accounts and what becomes of a page whose login ends, in Chromium over TLS: phone-wide, dark, by keyboard."""
+"""Login, accounts, and a page whose login ends, in Chromium over TLS: phone width, dark, by keyboard."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def page(browser: Any, served: Served) -> Iterator[Any]:
 
 
 def log_in(page: Any, name: str, password: str = PASSWORD) -> None:
-    """By keyboard: the name's field has the focus, as soon as the page listens."""
+    """Log in by keyboard. The field of the name has the focus once the page is ready."""
     page.locator("input[name=name]:focus").wait_for()
     page.keyboard.type(name)
     page.keyboard.press("Tab")
@@ -75,7 +75,7 @@ def test_from_the_login_to_a_run_and_out_again(page, served):
     page.get_by_role("button", name="Stop", exact=True).click()
     served.service.wait(run, "stopped")
     assert served.service.store.request(run).asked_by == served.service.store.status(run).stop.by == "operator"
-    page.wait_for_url(f"**/runs/{run}")                # it becomes the result
+    page.wait_for_url(f"**/runs/{run}")                # the page changes to the result
     fits(page)
     assert page.get_by_role("link", name="Audit").count() == 0
     page.goto("/")
@@ -85,7 +85,7 @@ def test_from_the_login_to_a_run_and_out_again(page, served):
     page.wait_for_url("**/login?next=%2F")
 
 
-def test_a_page_whose_login_has_ended_says_so_and_still_stops(page, served):
+def test_a_page_whose_login_has_ended_reports_it_and_can_still_stop(page, served):
     run = served.service.supervisor.start_run("a", {"note": "hold"}, "operator").request.id
     served.service.wait(run, "moving")
     page.goto(f"/runs/{run}/live")
@@ -103,7 +103,7 @@ def test_a_page_whose_login_has_ended_says_so_and_still_stops(page, served):
 
 
 @pytest.mark.heavy
-def test_a_page_from_before_a_new_login_still_stops(page, served):
+def test_a_page_from_before_a_new_login_can_still_stop(page, served):
     run = served.service.supervisor.start_run("a", {"note": "hold"}, "operator").request.id
     served.service.wait(run, "moving")
     page.goto(f"/runs/{run}/live")
@@ -119,7 +119,7 @@ def test_a_page_from_before_a_new_login_still_stops(page, served):
     assert served.service.store.status(run).stop.by == "engineer"
 
 
-def test_a_page_whose_script_does_not_come_sends_nothing(browser, served):
+def test_a_page_without_its_script_sends_nothing(browser, served):
     context = browser.new_context(base_url=served.url, ignore_https_errors=True)
     page = context.new_page()
     page.route("**/static/app.js?*", lambda route: route.abort())

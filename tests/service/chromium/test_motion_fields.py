@@ -1,4 +1,4 @@
-"""The fields of the motion on the start form in Chromium: wrong ones are marked at once, speeds follow the unit."""
+"""Fields of the motion on the start form in Chromium: wrong values are marked at once, speeds follow the unit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_wrong_values_of_the_motion_are_marked_at_once_and_stay_typed(page, serv
     typed = {"amplitude_rad_s": "fast", "periods": "many", "confidence": "20"}
     for name, text in typed.items():
         page.locator(f"[name={name}]").fill(text)
-    page.locator("#motion > summary").click()             # closed: a mistake opens it
+    page.locator("#motion > summary").click()             # closed: an error opens it
     page.locator("[name=offset_rad_s]").wait_for(state="hidden")
     page.get_by_role("button", name="Plan").click()
     page.get_by_role("alert").get_by_text("3 values can't be used").wait_for()

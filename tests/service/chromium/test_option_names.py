@@ -1,4 +1,4 @@
-"""The labels of the form in the texts of a run, and on the page that calibrates."""
+"""Labels of the form in the texts of a run, and on the page of the calibration."""
 
 from __future__ import annotations
 

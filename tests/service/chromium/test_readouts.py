@@ -116,7 +116,7 @@ def test_the_friction_of_compared_runs_follows_the_unit_of_speed(page, served, m
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("how", ["stopped", "lost", "failed"])
 def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served, how):
-    """A stop on purpose is no alarm; a lost watch and a fault are."""
+    """A requested stop is no alarm. A lost lease and a fault are alarms."""
     run = stopped(served)
     folder = served.service.store.place(run)
     state = json.loads((folder / "state.json").read_bytes())
@@ -144,7 +144,7 @@ def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served
     page.goto(f"/runs/{run}")
     page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").first.wait_for()
     assert page.get_by_role("heading", name="Speed and torque").count() == 1
-    assert page.get_by_role("heading", name="Uncertainty budget").count() == 1       # its picture is left out
+    assert page.get_by_role("heading", name="Uncertainty budget").count() == 1       # its picture is omitted
     bars = page.get_by_role("region", name="Uncertainty budget").get_by_role("row")
     assert [one.get_by_role("rowheader").inner_text() for one in bars.all()] == ["torque scale", "timing", "noise"]
     assert bars.first.get_by_role("meter").is_visible()
@@ -156,7 +156,7 @@ def test_a_run_that_ended_early_has_its_j_its_budget_and_its_stages(page, served
     assert page.get_by_text("This run was not watched: braking began at").count() == (1 if how == "lost" else 0)
 
 
-def test_a_run_that_ended_before_its_data_determined_j_says_so(page, served):
+def test_a_run_that_ended_before_its_data_determined_j_states_it(page, served):
     run = stopped(served)
     page.goto(f"/runs/{run}")
     page.get_by_text("No J: the run ended before its data determined one").wait_for()

@@ -83,7 +83,7 @@ def test_samples_that_are_made_first_show_their_progress(page, served, monkeypat
 def test_a_form_takes_no_text_before_what_is_stored_is_in_it(page, path, label, stored):
     held = []
 
-    def hold(route):           # a method of a list can't be a handler
+    def hold(route):           # a method of a list cannot be a handler
         held.append(route)
 
     page.route(f"**/api/v1{path}", hold)
@@ -98,7 +98,7 @@ def test_a_form_takes_no_text_before_what_is_stored_is_in_it(page, path, label, 
 
 @pytest.mark.heavy
 def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatch):
-    """After an edit, as after a signature: the page says so, shows the time, and then gives the new report."""
+    """After an edit or a signature, the page shows the progress and its time, and then the new report."""
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
     wait_for("its end", lambda: not served.service.supervisor.live())
@@ -132,7 +132,7 @@ def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatc
     assert Path(got.value.path()).read_text() == "<h1>with its order</h1>" and made == ["report.html", "report.pdf"]
 
 
-def test_a_rehearsal_shows_the_required_reaction_what_was_seen_and_its_verdict(page, served):
+def test_a_rehearsal_shows_the_required_and_observed_reaction_and_its_verdict(page, served):
     run = served.service.supervisor.start_run("a", {"note": "done", "fault": ["torque-scale=1.1"]}, "local").request.id
     served.service.wait(run, "done")
     path = served.service.store.place(run) / "state.json"
@@ -146,7 +146,7 @@ def test_a_rehearsal_shows_the_required_reaction_what_was_seen_and_its_verdict(p
     page.get_by_role("row", name="seen").get_by_text("the run went on to its end").wait_for()
 
 
-def test_an_acceptance_shows_expected_beside_identified_and_what_is_off(page, served):
+def test_an_acceptance_shows_expected_and_identified_values_and_differences(page, served):
     from tdhil.config import Expectation
     from tdhil.report import acceptance_of
 
@@ -243,9 +243,9 @@ def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_sig
 @pytest.mark.heavy
 @pytest.mark.parametrize("width", [390, 1280])
 def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, width):
-    """Every missing part is marked at its field; then the archive is there, with its digest.
+    """Every missing part is marked at its field. Then the page has the archive and its digest.
 
-    The run is of the simulated drive, so the page marks the archive as such without a question.
+    The run is of the simulated drive, so the page marks the archive accordingly without a question.
     """
     from functools import partial
 
@@ -292,7 +292,7 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
     assert (firmware.get_attribute("aria-invalid"), firmware.input_value()) == ("true", "from 10.1.2.3")
     firmware.fill("3.1")
     leak = UsageError("the archive would contain a private text", next_step="Remove a word with --remove")
-    with monkeypatch.context() as patched:      # found in the log: the worker names an option
+    with monkeypatch.context() as patched:      # found in the log; the worker names an option
         patched.setattr("tdhil.evidence.make_evidence", Mock(side_effect=leak))
         page.get_by_role("button", name="Make the archive").click()
         said = page.locator("#evidence-said")
@@ -370,7 +370,7 @@ def test_a_rehearsal_is_marked_wherever_its_run_is_shown(page, served):
 
 @pytest.mark.heavy
 def test_one_run_has_one_time_on_each_page(browser, served, monkeypatch):
-    """On the list, its page, the history and the comparison: the time of its request, in the reader's zone."""
+    """The list, its page, the history and the comparison show the time of its request, in the reader's time zone."""
     from tdhil.fleet import FleetRow, trend_document
 
     ids = []
@@ -481,7 +481,7 @@ def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
         for (const id of ["plot-speed", "plot-torque"]) document.querySelector(`#${id} .uplot:last-child`).remove();
         return above;
     }""")
-    assert 0 < above < 18            # px: the name of a stage stands above the area of the curve
+    assert 0 < above < 18            # px: the name of a stage is above the area of the curve
     time_s, speed_rad_s, torque_nm = move(0.5)
     assert (time_s, speed_rad_s, torque_nm) == pytest.approx((1.0, 10.0 * time_s, -20.0 * time_s), abs=0.06)
     move(0.25)
@@ -544,7 +544,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.get_by_label("Model").select_option("rigid")
     page.get_by_label("Tolerance: half-width").fill("a lot")
     page.get_by_role("button", name="Replay").click()
-    page.locator("#wrong-tolerance").get_by_text("a number and its unit").wait_for()         # and not passed over
+    page.locator("#wrong-tolerance").get_by_text("a number and its unit").wait_for()         # and not skipped
     page.get_by_label("Tolerance: half-width").fill("0,1")
     page.get_by_role("button", name="Replay").click()
     page.get_by_role("row", name="model rigid, tolerance 0.001").get_by_text("104.5 (99.0 to 110.0)").wait_for()
@@ -564,7 +564,7 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.get_by_label("Delay after").fill("1.5")
     page.get_by_label("internal-limit: share").fill("20%")
     page.get_by_role("button", name="Rehearse internal-limit").click()
-    page.wait_for_url(re.compile("/runs/[^/]+$"))                          # by itself: the page becomes the result
+    page.wait_for_url(re.compile("/runs/[^/]+$"))                          # without a click
     begun = served.service.store.request(served.service.store.ids()[0])
     assert begun.options["fault"] == ["internal-limit@speed+1.5s=20%"]
 
@@ -583,7 +583,7 @@ def test_a_trace_is_added_with_its_columns_corrected_and_becomes_a_marked_run(pa
     assert rated.get_attribute("aria-invalid") == "true" and page.locator(".mini canvas").count() == 0
     assert (speed.input_value(), page.locator("[name='unit.time']").input_value()) == ("Drehzahl ist", "ms")
     assert page.locator("#table th.mapped small").all_inner_texts() == ["time", "speed", "torque"]
-    speed.select_option("Zeit")                     # wrong, and marked at once with all that is wrong
+    speed.select_option("Zeit")                     # wrong values, all marked at once
     page.get_by_text("This column is already that of time").wait_for()
     page.get_by_role("button", name="Identify").click()
     page.locator(".wrong").nth(1).wait_for()
@@ -605,7 +605,7 @@ def test_a_trace_is_added_with_its_columns_corrected_and_becomes_a_marked_run(pa
 
 @pytest.mark.heavy
 def test_a_refused_identification_names_and_marks_its_fields_and_keeps_what_was_typed(page, served, monkeypatch):
-    """Also the refusal of the worker process, which names options of the command line, and one of no field."""
+    """This includes refusals of the worker process, with options of the command line, and one without a field."""
     play_uploads(served.service, monkeypatch)
     works = served.service.supervisor.work
 
@@ -635,7 +635,7 @@ def test_a_refused_identification_names_and_marks_its_fields_and_keeps_what_was_
     monkeypatch.setattr("tdhil.service.upload_routes.upload_options", lambda body, kind: ({}, list(wrong)))
     page.get_by_role("button", name="Identify").click()
     page.locator("#wrong-rated_torque_nm").wait_for()
-    assert said.inner_text() == "columns: one column can't hold two quantities"        # of no field: it was left out
+    assert said.inner_text() == "columns: one column can't hold two quantities"        # without a field: it was omitted
 
 
 @pytest.mark.heavy

@@ -1,4 +1,4 @@
-"""The pages of a rig in Chromium: a new rig, its card, its calibration, and the letterhead of the site."""
+"""Pages of a rig in Chromium: a new rig, its card, its calibration, and the letterhead of the site."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_letterhead_is_set_and_an_svg_refused_at_its_field(page, served):
     assert page.evaluate("window.pwned") is None
 
 
-def test_what_cant_be_done_here_says_why_before_the_click(page, served):
+def test_an_unavailable_action_gives_the_reason_before_the_click(page, served):
     page.goto("/start/watched")
     page.get_by_text("This rig moves only while a logged-in user watches it").wait_for()
     assert page.get_by_role("button", name="Start").count() == 0
@@ -58,7 +58,7 @@ def test_what_cant_be_done_here_says_why_before_the_click(page, served):
     assert not page.get_by_text("You can change here").is_visible()
 
 
-def test_a_rehearsal_with_a_wrong_value_says_so_at_that_fault(page, served):
+def test_a_wrong_value_of_a_rehearsal_is_marked_at_its_fault(page, served):
     page.goto("/rehearse/a")
     button = page.get_by_role("button", name="Rehearse torque-scale", exact=True)
     row = page.locator("#faults li", has=button)
@@ -131,7 +131,7 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     page.get_by_role("button", name="Save the rig").click()
     page.get_by_text("entries need a correction").wait_for()
     assert "is not a unit of speed" in box("Highest speed").locator("xpath=..").inner_text()
-    page.locator("[data-field=accept_unverified] .wrong").wait_for()         # a mistake that has no field of its own
+    page.locator("[data-field=accept_unverified] .wrong").wait_for()         # an error without its own field
     assert not (rigs / "bench-3.yaml").exists()
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, sent: {"document": {
         "found": [{"address": 3, "title": HOSTILE, "identity": HOSTILE, "simulated": False, "profile": "maxon/epos4",
@@ -167,12 +167,12 @@ def test_the_steps_of_a_new_rig(page, served, rigs, monkeypatch):
     page.get_by_role("button", name="Start: preflight, then the code").wait_for()
     page.get_by_role("heading", name="First motion of this rig").wait_for()          # its steps, and a careful plan
     page.get_by_text("The shaft moves for the first time: at most 200 N·m and 3 rad.").wait_for()
-    assert page.locator("[name=highest_speed_rad_s]").input_value() == "41"    # rpm, as the switch says: 4.29 rad/s
+    assert page.locator("[name=highest_speed_rad_s]").input_value() == "41"    # rpm, as set by the switch: 4.29 rad/s
     page.get_by_text("The shaft turns at 14 and then at 30.2 rpm.").wait_for()
     checks = [{"grade": grade, "name": HOSTILE, "said": HOSTILE, "do": do} for grade, do in
               (("ok", ""), ("note", ""), ("bad", "Choose its own profile"))]
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, sent: {"document": {"checks": checks}})
-    page.get_by_role("button", name="Check the drive").click()          # before the first motion, and without any
+    page.get_by_role("button", name="Check the drive").click()          # before the first motion, and without motion
     page.get_by_text("Failed: 1 of 3 checks. Correct them before the first motion.").wait_for()
     rows = page.get_by_role("region", name="Findings of the check").locator("tbody tr")
     assert [row.locator("td").first.inner_text() for row in rows.all()] == ["pass", "for information", "fail"]
@@ -194,10 +194,10 @@ def test_a_simulated_rig_is_added_without_a_drive(page, rigs):
     for hidden in ("Settings at the drive", "Scan for the drive", "Motion from the browser"):
         assert page.get_by_text(hidden, exact=True).count() == 1
         assert not page.get_by_text(hidden, exact=True).is_visible()
-    page.reload()                                                   # what was typed is there again
+    page.reload()                                                   # the typed values are restored
     page.get_by_label("Simulated: there is no drive").wait_for()
     page.get_by_text("Type all of them or none").wait_for()
-    page.get_by_label("Name in reports").fill("Prüfstand Größe 1")          # an id that a German recognizes
+    page.get_by_label("Name in reports").fill("Prüfstand Größe 1")          # an id that Germans recognise
     assert page.get_by_label("Id:").input_value() == "prufstand-grosse-1"
     page.get_by_label("Name in reports").fill("Bench 4")
     gear = page.get_by_role("textbox", name="Gear:")
@@ -241,7 +241,7 @@ def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
     page.get_by_label("Its standard uncertainty").fill("-1")
     calibrate = page.get_by_role("button", name="Calibrate")
     calibrate.click()
-    page.locator("#wrong-with_body", has_text="Choose two different runs.").wait_for()      # each at its field, at once
+    page.locator("#wrong-with_body", has_text="Choose two different runs.").wait_for()      # at once, each at its field
     page.locator("#wrong-added_kg_m2", has_text="as a positive number of kg·m²").wait_for()
     assert {one.get_attribute("name") for one in page.locator("#calibrate [aria-invalid=true]").all()} == {
         "with_body", "added_kg_m2", "added_sd_kg_m2"}
@@ -271,8 +271,8 @@ def test_the_steps_of_a_torque_calibration(page, served, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_a_newcomer_clicks_twice_and_has_a_result(browser, tmp_path):
-    """The service as a process, its own simulated rigs, a real run; how long it took is said (`pytest -s`)."""
+def test_a_new_user_has_a_result_after_two_clicks(browser, tmp_path):
+    """The service is a process with its own simulated rigs and a real run. `pytest -s` shows the duration."""
     from tests.service.test_serve import served as process
 
     began_s = time.monotonic()

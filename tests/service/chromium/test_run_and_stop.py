@@ -1,4 +1,4 @@
-"""A run in Chromium: what its page shows, how it is stopped, and what follows when its page or the service is gone."""
+"""Run in Chromium: content of its page, stops, and the loss of its page or of the service."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ HIDE = """hidden => {
 }"""
 
 
-def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
+def test_a_requested_stop_is_no_alarm(page, served):
     run = begin(served)
     page.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
-    page.wait_for_url(f"**/runs/{run}")                # the page becomes the result
+    page.wait_for_url(f"**/runs/{run}")                # the page changes to the result
     page.get_by_text("stopped, at standstill").wait_for()
     page.get_by_role("list", name="Stop").get_by_text("drive replied").wait_for()
     assert page.locator("#result .alarm").count() == 0
@@ -37,7 +37,7 @@ def test_a_stop_that_was_asked_for_is_no_alarm(page, served):
 @pytest.mark.parametrize(("what", "state"), [
     ("identify", "failed"), ("ask", "refused"), ("brake", "stop_not_confirmed"),
 ])
-def test_a_page_becomes_the_result_once_the_shaft_stands_still(page, served, what, state):
+def test_a_page_changes_to_the_result_once_the_shaft_is_at_standstill(page, served, what, state):
     """Also after a failure and a refusal. If standstill is not confirmed, the live page with its Stop stays. Else the
     live page has no Stop any more.
     """
@@ -54,13 +54,22 @@ def test_a_page_becomes_the_result_once_the_shaft_stands_still(page, served, wha
         page.locator("#state", has_text="STOP NOT CONFIRMED").wait_for()
         page.wait_for_timeout(500)
         assert page.url.endswith("/live") and page.get_by_role("link", name="To the result").is_visible()
-        assert page.get_by_role("button", name="Stop", exact=True).is_visible()
+        asked: list[str] = []
+
+        def answered(route: Any) -> None:
+            asked.append(route.request.url)
+            route.fulfill(json={"runs": [], "said": "tdhil stop did NOT confirm standstill", "exit_code": 8})
+
+        page.route("**/rigs/a/stop", answered)         # the run is over, so the Stop is that of its rig
+        page.get_by_role("button", name="Stop", exact=True).click()
+        page.get_by_text("tdhil stop did NOT confirm standstill. Use the hard-wired emergency stop").wait_for()
+        assert len(asked) == 1
     else:
         page.wait_for_url(f"**/runs/{run}")
-        page.goto(f"/runs/{run}/live")                 # looked at again: nothing is left to stop
+        page.goto(f"/runs/{run}/live")                 # opened again: there is no Stop
         page.get_by_role("link", name="To the result").wait_for()
         assert page.get_by_role("button", name="Stop", exact=True).is_hidden()
-    os.kill(stored["pid"], signal.SIGKILL)             # it did not end: only its file says so
+    os.kill(stored["pid"], signal.SIGKILL)             # it did not end: only its file states this
 
 
 def test_a_sign_off_without_words_is_refused_at_its_field(page, served):
@@ -95,7 +104,7 @@ def test_a_result_shows_j_then_a_picture_then_the_budget_and_its_events_folded(p
     page.locator("#log-events li").first.wait_for()
 
 
-def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
+def test_a_stop_shows_the_times_of_request_receipt_and_standstill(page, served):
     run = begin(served)
     page.goto(f"/runs/{run}/live")
     page.get_by_text("Not an emergency stop.").wait_for()
@@ -105,11 +114,11 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     page.get_by_text("drive replied").wait_for()
     served.service.wait(run, "stopped")
     page.get_by_text("stopped, at standstill").wait_for()
-    page.locator("li", has_text="stop requested ").wait_for()          # the page of the result names what was requested
+    page.locator("li", has_text="stop requested ").wait_for()          # the page of the result shows the request
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
-def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
+def test_a_late_reply_does_not_revert_a_newer_one(page, served):
     run = begin(served, "brake")
     page.goto(f"/runs/{run}/live")
     page.locator("#state", has_text="moving").wait_for()
@@ -128,7 +137,7 @@ def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
     page.get_by_text("stopped, at standstill").wait_for()
 
 
-def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monkeypatch):
+def test_a_drive_in_use_by_a_terminal_is_stopped_from_its_card(page, served, monkeypatch):
     told = [(True, "tdhil stop confirmed standstill"), (False, "tdhil stop did NOT confirm standstill")]
     monkeypatch.setattr("tdhil.service.supervisor._stop_seen", lambda command: told.pop(0))
     with hold(served.service.supervisor.rigs.get("real").address):
@@ -141,14 +150,14 @@ def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monk
 
 
 @pytest.mark.parametrize("way", ["offline", "mute"])
-def test_a_stop_that_nobody_hears_says_so(page, served, way):
+def test_a_stop_without_a_reply_is_reported(page, served, way):
     run = begin(served)
     page.goto(f"/runs/{run}/live")
     page.locator("#state", has_text="moving").wait_for()
     if way == "offline":
         page.context.set_offline(True)
     else:
-        page.route("**/stop", lambda route: None)           # neither an answer nor an error
+        page.route("**/stop", lambda route: None)           # neither a reply nor an error
     page.get_by_role("button", name="Stop", exact=True).click()
     page.get_by_text("NOT DELIVERED: use the hard-wired emergency stop").wait_for()
     if way == "offline":
@@ -156,8 +165,8 @@ def test_a_stop_that_nobody_hears_says_so(page, served, way):
     assert served.service.store.status(run).stop.asked is None
 
 
-def test_the_time_left_of_a_simulated_run_is_that_of_the_clock(page, served):
-    """In stepped time, ten seconds of the run pass in one: 60 s of it are 6 s at the desk."""
+def test_the_time_left_of_a_simulated_run_is_in_real_time(page, served):
+    """Ten seconds of a stepped run take one second, so 60 s of it take 6 s."""
     run, sockets = begin(served), []
     status = json.loads((served.service.store.place(run) / "state.json").read_bytes()) | {
         "simulated": True, "stage": "acquire", "expected_s": {"acquire": 100.0}}
@@ -175,7 +184,7 @@ def test_the_time_left_of_a_simulated_run_is_that_of_the_clock(page, served):
     tell(0.0, "hello")
     page.get_by_text("moving").first.wait_for()
     page.clock.run_for(1000)
-    assert page.locator("#left").inner_text() == ""             # the pace is not yet known
+    assert page.locator("#left").inner_text() == ""             # the pace is not known yet
     page.clock.run_for(3000)
     tell(40.0)
     page.clock.run_for(500)
@@ -184,21 +193,21 @@ def test_the_time_left_of_a_simulated_run_is_that_of_the_clock(page, served):
     assert 5.0 <= float(re.search(r"([\d.]+) s", left.inner_text())[1]) <= 8.0
 
 
-def test_values_grow_grey_once_nothing_comes(page, served):
+def test_values_turn_grey_without_new_data(page, served):
     run = begin(served)
     folder = served.service.store.place(run)
     write(folder / "other.mcap")
     (folder / "other.mcap").replace(folder / "run.mcap")
     page.goto(f"/runs/{run}/live")
     page.locator("#speed", has_text="19.").wait_for()
-    # The log is old, and the run said to be moving: that alone is grey.
+    # The log is old and the run is in motion: only the values are grey.
     page.locator("body.stale").wait_for()
     assert not page.locator("#away").is_visible()
     served.end()
     page.get_by_text("No connection to tdhil serve").wait_for()
 
 
-def test_six_tabs_and_a_stop_still_gets_through(page, served):
+def test_with_six_tabs_a_stop_is_still_received(page, served):
     run = begin(served)
     for one in (*(page.context.new_page() for _ in range(5)), page):
         one.goto(f"/runs/{run}/live")
@@ -208,7 +217,7 @@ def test_six_tabs_and_a_stop_still_gets_through(page, served):
 
 
 def watched_run(page: Any, served: Served) -> str:
-    """It moves, and this page holds its lease."""
+    """Return a run in motion whose lease this page holds."""
     run = begin(served, "ask", "rehearsed")
     page.goto(f"/runs/{run}/live")
     page.get_by_label("Six digits").fill("123 456")
@@ -218,7 +227,7 @@ def watched_run(page: Any, served: Served) -> str:
 
 
 def lost(served: Served, run: str) -> Any:
-    """How the run's page went, once the run was made to brake for it."""
+    """Return how the page of the run was lost, once the run brakes because of it."""
     served.service.wait(run, "stopped")
     watch = served.service.store.status(run).watch
     assert watch.lost is not None
@@ -227,14 +236,14 @@ def lost(served: Served, run: str) -> Any:
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("way", "how"), [("hidden", "hidden"), ("closed", "closed"), ("offline", "silent")])
-def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
+def test_a_watched_run_brakes_once_its_page_is_lost(page, served, way, how):
     run = watched_run(page, served)
     if way == "closed":
         other = page.context.new_page()
         other.goto(f"/runs/{run}/live")
         other.get_by_text("watches this run on another page").wait_for()
         page.close()
-        other.get_by_text("This run was not watched: braking began").wait_for()     # to look is not to hold
+        other.get_by_text("This run was not watched: braking began").wait_for()     # a second page has no lease
     elif way == "offline":
         page.context.set_offline(True)
         page.get_by_text("The run receives nothing from this page").wait_for()
@@ -245,7 +254,7 @@ def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
 
 
 @pytest.mark.heavy
-def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_moment(page, served):
+def test_a_watched_run_continues_if_its_page_is_reloaded_or_hidden_briefly(page, served):
     run = watched_run(page, served)
     page.reload()
     page.get_by_text("You watch this run").wait_for()
@@ -254,9 +263,9 @@ def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_mome
     page.evaluate(HIDE, False)
     page.wait_for_timeout(5500)            # longer than a lease
     status = served.service.store.status
-    wait_for("its page", lambda: status(run).watch.gone is None or status(run).state != "moving")      # a moment late
+    wait_for("its page", lambda: status(run).watch.gone is None or status(run).state != "moving")      # slightly late
     assert status(run).state == "moving"
-    copy = page.context.new_page()         # a tab that is copied has what the first had kept: the later one holds
+    copy = page.context.new_page()         # a copied tab has the stored lease of the first one: the later tab holds it
     copy.goto("/")
     copy.evaluate("kept => sessionStorage.setItem(...kept)", page.evaluate("Object.entries(sessionStorage)[0]"))
     copy.goto(f"/runs/{run}/live")
@@ -267,8 +276,8 @@ def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_mome
 
 
 @pytest.mark.heavy
-def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
-    """Its process is frozen: SIGTERM reaches it, and does nothing."""
+def test_a_run_that_receives_no_stop_is_not_reported_as_stopped(page, served):
+    """Its process is frozen, so SIGTERM has no effect."""
     run = begin(served, "frozen")
     page.goto(f"/runs/{run}/live")
     with page.expect_response("**/stop") as answered:
@@ -282,8 +291,8 @@ def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
     served.service.wait(run, "interrupted")
 
 
-def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, served):
-    run = begin(served, "brake")               # it brakes on: one that has stopped becomes its result
+def test_a_page_that_is_reloaded_while_a_run_brakes_shows_its_stop(page, served):
+    run = begin(served, "brake")               # it continues to brake; a stopped run would show its result
     page.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     page.reload()
@@ -293,7 +302,7 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
 
 
 @pytest.mark.heavy
-def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
+def test_a_page_reports_a_missing_service(page, served, monkeypatch):
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
     results(served, run, monkeypatch)

@@ -1,4 +1,4 @@
-"""The pages of the list of runs in Chromium: filters, order and page stand in the address, and a choice stays."""
+"""Pages of the list of runs in Chromium: the address has filters, order and page, and a choice is kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RUNS = 250
 
 @pytest.fixture
 def many(served: Any) -> Any:
-    """Rows of runs in the index: 250, of which the newest are numbered the highest."""
+    """Add 250 rows of runs to the index; the newest have the highest numbers."""
     index = served.service.index
     index.rebuild()
     for one in rows(RUNS):
@@ -29,7 +29,7 @@ def shown(page: Any) -> list[int]:
     return [int(one) for one in re.findall(r"run (\d+)", page.locator("#runs").inner_text())]
 
 
-def test_the_pages_of_the_list_are_turned_and_their_addresses_kept(page, many):
+def test_the_pages_of_the_list_have_permanent_addresses(page, many):
     page.goto("/runs")
     page.get_by_text("Runs 1 to 100 of 250").wait_for()
     assert shown(page) == list(range(249, 149, -1))
@@ -50,7 +50,7 @@ def test_the_pages_of_the_list_are_turned_and_their_addresses_kept(page, many):
     assert page.get_by_role("button", name="Compare", exact=True).is_enabled()
     many.service.index.put(replace(rows(1)[0], id="20260102-000000-000000", note="run 999", archived=False))
     page.goto(kept)
-    page.get_by_text("Runs 201 to 250 of 250").wait_for()      # a new run moved nothing
+    page.get_by_text("Runs 201 to 250 of 250").wait_for()      # a new run changes no page
     assert shown(page) == list(range(49, -1, -1))
     page.get_by_role("link", name="Previous page").click()
     page.get_by_role("link", name="Previous page").click()
@@ -62,7 +62,7 @@ def test_search_filters_and_order_reach_runs_of_every_page(page, many):
     page.goto("/runs")
     page.get_by_label("Search").fill("run 7")
     page.get_by_text(re.compile(r"^Runs 1 to \d+ of \d+$")).wait_for()
-    page.locator("#runs").get_by_text(re.compile(r"run 7\b")).wait_for()          # the oldest page has it
+    page.locator("#runs").get_by_text(re.compile(r"run 7\b")).wait_for()          # it is on the oldest page
     page.get_by_label("Search").fill("")
     page.get_by_text("Runs 1 to 100 of 250").wait_for()
     page.locator("select[name=rig]").select_option("b")
@@ -77,7 +77,7 @@ def test_search_filters_and_order_reach_runs_of_every_page(page, many):
     assert values == known and len(known) > 2
     address = page.url
     page.goto("/")
-    page.goto(address)                                          # the address has all of it
+    page.goto(address)                                          # the address has all conditions
     page.get_by_text(f"Runs 1 to {len(expected)} of {len(expected)}").wait_for()
     assert page.locator("select[name=rig]").input_value() == "b" and page.get_by_label("Tag").input_value() == "bearing"
     page.locator("th[aria-sort=ascending]").wait_for()

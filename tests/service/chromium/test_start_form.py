@@ -1,4 +1,4 @@
-"""The start form and its plan in Chromium: a mistake stands at its field; nothing starts before it is allowed."""
+"""Start form and plan in Chromium: errors are at their fields, and nothing starts before it is allowed."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     page.wait_for_url("**/start/a")
     page.get_by_label("Tolerance: half-width").focus()
     page.keyboard.type("2,5")
-    page.keyboard.press("Enter")       # as the first button would have it: a plan, and nothing begins by mistake
+    page.keyboard.press("Enter")       # the first button makes a plan, so nothing starts by mistake
     page.get_by_role("row", name="expected interval of J").get_by_text("±2.1 %").wait_for()
     assert served.service.store.ids() == []
     page.locator("button[value=start]:enabled").wait_for()
     page.get_by_role("button", name="Start").focus()
     page.keyboard.press("Enter")
-    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").wait_for()       # by itself: the page becomes the result
+    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").wait_for()       # without a click
     assert "/live" not in page.url
     (run,) = served.service.store.ids()
     assert served.service.store.request(run).options == {"tolerance": 0.025}
     page.get_by_role("link", name="The recorded motion").click()
     page.locator("#readout").wait_for()
-    page.get_by_role("link", name="To the result").wait_for()             # the record stays
+    page.get_by_role("link", name="To the result").wait_for()             # the record is kept
 
 
-def test_an_error_names_the_field_and_takes_the_old_plan_away(page, served, monkeypatch):
-    """The terminal's words are options: on the form they are its labels, and the field is marked."""
+def test_an_error_names_the_field_and_removes_the_old_plan(page, served, monkeypatch):
+    """The terminal names options. The form shows its labels instead and marks the field."""
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
     page.goto("/start/a")
     page.get_by_role("button", name="Plan").click()
@@ -59,8 +59,8 @@ def test_an_error_names_the_field_and_takes_the_old_plan_away(page, served, monk
     assert not page.locator("#plan").is_visible()
 
 
-def test_all_wrong_values_of_the_start_form_are_said_at_once(page, served):
-    """Each field is marked and has its own words; the labels are the form's, and no option of the terminal is named."""
+def test_all_wrong_values_of_the_start_form_are_reported_at_once(page, served):
+    """Each field is marked and has its own message with labels of the form, without options of the terminal."""
     page.goto("/start/a")
     page.get_by_text("Simulated rig", exact=True).click()
     for name, text in (("tolerance", "lots"), ("max_time_s", "-5"), ("seed", "-4")):
@@ -86,8 +86,8 @@ def test_all_wrong_values_of_the_start_form_are_said_at_once(page, served):
     assert [one.get_attribute("name") for one in marked.all()] == ["tolerance"]
 
 
-def test_all_mistakes_are_said_in_the_order_of_the_form_and_the_keyboard_is_at_the_first(page, served):
-    """The service names a limit last, and two faults of one field. Each wrong field is described by its reasons."""
+def test_all_errors_are_in_the_order_of_the_form_and_the_first_has_the_focus(page, served):
+    """The service names a limit last, and two errors of one field. Each wrong field has its reasons as description."""
     page.goto("/start/a")
     page.get_by_text("Simulated rig", exact=True).click()
     page.locator("#motion > summary").click()
@@ -106,12 +106,12 @@ def test_all_mistakes_are_said_in_the_order_of_the_form_and_the_keyboard_is_at_t
         listed = page.locator("#said li strong").all_inner_texts()
         assert listed == [page.locator("label", has=page.locator(f"[name={name}]")).get_attribute("data-label")
                           for name in ("tolerance", "amplitude_rad_s", "fault", "fault")]
-        page.get_by_role("heading", name="Limits").click()             # the keyboard is elsewhere again
+        page.get_by_role("heading", name="Limits").click()             # the focus is elsewhere again
     assert served.service.store.ids() == []
 
 
-def test_a_run_by_the_clock_says_first_whether_this_computer_holds_its_rate(page, served, monkeypatch):
-    """A computer under load is named before Start; a second Start goes on. Unasked, a simulated run is stepped."""
+def test_before_a_run_in_real_time_the_rate_of_this_computer_is_checked(page, served, monkeypatch):
+    """A computer under load is reported before the start; a second Start continues. The default is stepped time."""
     found = {"rate_hz": 100.0, "cycles": 150, "late": 12, "worst_s": 0.03, "holds": False,
              "text": "This computer does not"}
     asked = []
@@ -132,8 +132,8 @@ def test_a_run_by_the_clock_says_first_whether_this_computer_holds_its_rate(page
     assert served.service.store.request(run).options == {"real_time": True}
 
 
-def test_a_wait_shows_how_long_it_lasts_and_how_long_it_usually_does(page, served, monkeypatch):
-    """A plan takes seconds: a bar and its time, and at the second time the usual time too; asked twice, made once."""
+def test_a_wait_shows_its_duration_and_the_usual_one(page, served, monkeypatch):
+    """A plan takes seconds: the page shows a bar and its time, later the usual time too. Two requests give one plan."""
     goes_on, asked = threading.Event(), []
 
     def slow(what: str, run: Any, wanted: Any) -> Any:
@@ -172,7 +172,7 @@ def test_expected_values_are_typed_on_the_start_form(page, served):
 
 
 @pytest.mark.heavy
-def test_a_plan_of_other_values_is_taken_away(page, served, monkeypatch):
+def test_a_plan_of_other_values_is_removed(page, served, monkeypatch):
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": PLAN})
     page.goto("/start/a")
     page.get_by_role("button", name="Plan").click()
@@ -190,7 +190,7 @@ def test_a_wrong_time_of_a_rehearsal_starts_no_run(page, served):
     assert served.service.store.ids() == []
 
 
-def test_the_code_is_asked_for_and_a_wrong_one_said(page, served):
+def test_the_code_is_requested_and_a_wrong_one_reported(page, served):
     run = begin(served, "ask", "real")
     page.goto(f"/runs/{run}/live")
     page.get_by_text("this moves").wait_for()
@@ -206,7 +206,7 @@ def test_the_code_is_asked_for_and_a_wrong_one_said(page, served):
     served.service.wait(run, "done")
 
 
-def test_every_point_of_the_checklist_is_ticked_before_the_shaft_may_be_moved(page, served):
+def test_every_point_of_the_checklist_must_be_ticked_before_motion(page, served):
     points = "Before you confirm:\n  [ ] brake released\n  [ ] people clear of the shaft\n"
     run = served.service.supervisor.start_run("real", {"note": "ask", "operator": points}, "local").request.id
     served.service.wait(run, "awaiting_confirmation")
@@ -215,7 +215,7 @@ def test_every_point_of_the_checklist_is_ticked_before_the_shaft_may_be_moved(pa
     page.get_by_label("brake released").check()
     assert move.is_disabled()
     page.get_by_label("Six digits").fill("123456")
-    page.get_by_label("Six digits").press("Enter")          # no way round
+    page.get_by_label("Six digits").press("Enter")          # no other way
     page.get_by_label("people clear of the shaft").check()
     assert move.is_enabled()
     assert served.service.store.status(run).state.value == "awaiting_confirmation"
