@@ -1,21 +1,21 @@
-"""One setting for every property test: the same examples at every run. TDHIL_FUZZ=1 looks for new ones instead.
+"""Common settings of all tests. Property tests use the same examples in every run; with TDHIL_FUZZ=1 new ones.
 
-The README's command takes what is quick, so that it stays below four minutes. Heavy cases run in CI (--heavy: those
-alone), the longest with --long only, which the header of every run says. A commit's CI runs one of nine shares of the
+The command of the README runs the quick tests, in less than four minutes. Heavy cases run in CI (--heavy: only
+those), the longest with --long only; the header of every run states this. CI of a commit runs one of nine shares of the
 heavy cases (--share), so that it ends in 20 minutes: decision 0061.
-What the markers mean: pyproject.toml.
+pyproject.toml explains the markers.
 
-A test in real time (`real_time`) that fails has shown nothing where this computer stood still meanwhile: a drive's
-watchdog acts then, and a run that is late ends itself, as both should. It is run again, and the log says so. So it is
-where the run itself says that it was late.
+A failed test in real time (`real_time`) is run again if this computer stood still during it, and the log states this.
+In such a pause the watchdog of a drive acts, and a late run ends itself, both rightly. The same applies if the run
+itself reports that it was late.
 
-And Ctrl-C as usual: a shell that starts the tests in the background has it ignored, which every child would inherit.
+Ctrl-C has its default handler: a shell that starts the tests in the background ignores it, and children inherit this.
 
-Nothing that collection makes is garbage: it is looked through for some neither while it is made (a fifth of the time
-that this takes) nor ever after. And what is compiled is kept, for the programs that are started by the hundred: where
-the environment forbids it (PYTHONDONTWRITEBYTECODE), each of them would compile all of ours anew.
+Collection produces no garbage. Garbage collection is off during it, which saves a fifth of its time, and skips its
+objects later. Bytecode is kept for the hundreds of started programs: with PYTHONDONTWRITEBYTECODE, each of them would
+compile all modules again.
 
-Linear algebra has one thread: beside another worker of pytest two of them wait for each other, for twice the time.
+Linear algebra has one thread: with several pytest workers, two threads wait for each other and take twice the time.
 """
 
 import argparse
@@ -50,7 +50,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 GROUPS = "one_worker"
-"""Where a worker of pytest-xdist finds the file's name in which it writes what its `one_worker` items belong to."""
+"""Key of the file name in which a worker of pytest-xdist writes the groups of its `one_worker` items."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -70,7 +70,7 @@ def share(text: str) -> tuple[int, int]:
 
 
 def in_share(nodeid: str, one: int, of: int) -> bool:
-    """A case stays in its share, whatever cases are added beside it."""
+    """Return whether a case is in the share. It stays there if other cases are added."""
     return zlib.crc32(nodeid.encode()) % of == one - 1
 
 
@@ -86,7 +86,7 @@ def groups_file(config: pytest.Config) -> Path:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def]
-    """Not --dist loadgroup: with pytest 9, whose node-IDs pytest-xdist 3.8 can't mark, it groups nothing."""
+    """Replace --dist loadgroup, which has no effect with pytest 9, since pytest-xdist 3.8 cannot mark its node-IDs."""
     from functools import cached_property
 
     from xdist.scheduler import LoadScopeScheduling
@@ -94,14 +94,14 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
     class ByMarker(LoadScopeScheduling):
         @cached_property
         def groups(self) -> dict[str, str]:
-            """Asked for only when every worker has collected, and the first has written them."""
+            """Return the groups, which the first worker has written once every worker has collected."""
             return json.loads(groups_file(config).read_text())
 
         def _split_scope(self, nodeid: str) -> str:
             return self.groups.get(nodeid, nodeid)
 
         def mark_test_complete(self, node, item_index: int, duration: float = 0) -> None:  # type: ignore[no-untyped-def]
-            """Forget a group that is done: pytest-xdist counts all groups of a worker again after each test."""
+            """Remove a completed group: pytest-xdist counts all groups of a worker again after each test."""
             super().mark_test_complete(node, item_index, duration)
             groups = self.assigned_work[node]
             done = self._split_scope(self.registered_collections[node][item_index])
@@ -149,7 +149,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def no_bus_of_the_user(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Neither the environment nor the files of the user who runs the tests name a bus."""
+    """Remove the bus settings of the user from environment and configuration files."""
     for name in [name for name in os.environ if name.startswith("CAN_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -158,12 +158,12 @@ def no_bus_of_the_user(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 STOOD_STILL_S = 0.5
 LATE = ("stood still for", "host or adapter late", "host was silent for too long")
-"""Of what a run says at its end (drivers)."""
+"""Texts in the message of a late run (drivers)."""
 TRIES = 4
 
 
 class Stalls:
-    """``longest_s``: for how long a thread that only sleeps came back late, while this was entered."""
+    """Monitor of pauses. ``longest_s``: longest delay of a sleeping thread while the context is active."""
 
     def __enter__(self) -> "Stalls":
         self.longest_s, self._over = 0.0, threading.Event()

@@ -1,6 +1,6 @@
-"""A network of its own for the programs of one test: a namespace of Linux, in which only the loopback exists.
+"""Own network for the programs of one test: a Linux namespace with the loopback only.
 
-So a fixed port of a tutorial is free, whatever else runs on this computer, and nothing else can reach it.
+A fixed port of a tutorial is therefore free, and other programs cannot reach it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ sys.stdin.read()
 
 @contextlib.contextmanager
 def own_network() -> Iterator[tuple[str, ...]]:
-    """Yield the words that, before a command, run it in the new network; () where the system allows none.
+    """Yield the command prefix that runs a command in the new network; () if the system permits none.
 
     As root it is a network namespace. Another user needs a user namespace too, which some systems forbid.
     """

@@ -1,6 +1,6 @@
-"""The rig of the tests, declared once: its limits for each reader, its files, its plant.
+"""Rig of the tests, declared once: its limits for each reader, its files, its plant.
 
-It is the rig of the simulated drive: 0.5 to 10 rad/s, 400 N·m, 15 minutes. A test states only what differs from it.
+It is the rig of the simulated drive: 0.5 to 10 rad/s, 400 N·m, 15 minutes. A test states only its differences.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ NUMBERS = {
 """Limits by their keys in rig.yaml, SI at the motor shaft."""
 
 LIMITS = MachineLimits(**NUMBERS)
-"""The limits as the runner gets them."""
+"""Limits for the runner."""
 
 DRIVE_LIMITS = DriveLimits(LIMITS.speed_max_rad_s, LIMITS.torque_nm, LIMITS.quick_stop_rad_s2, LIMITS.watchdog_s)
-"""The limits as a drive gets them."""
+"""Limits for a drive."""
 
 QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)
-"""The simulated drive and shaft without noise, lag and rounding."""
+"""Simulated drive and shaft without noise, lag and rounding."""
 
 STRING = "load: string\nmake_up_torque_nm: 29000\ntorque_ramp_nm_s: 400\n"
 """Keys of rig.yaml for a drill string on the shaft."""
@@ -39,7 +39,7 @@ class FieldRig:
     inertia: float = 104.0
     viscous: float = 8.0
     coulomb: float = 60.0
-    torque_lag: float = 0.010        # of the motor behind its command
+    torque_lag: float = 0.010        # lag of the motor torque
     load_sd: float = 3.0             # Ornstein-Uhlenbeck load disturbance
     load_time: float = 0.5
     ripple_sd: float = 10.0          # motor torque, white per step
@@ -57,7 +57,7 @@ def limits_text(**changes: object) -> str:
 
 
 PATIENT_S = 5.0
-"""Watchdog time for real time on a busy computer: a loop may pause for half of it."""
+"""Watchdog time for real time on a busy computer, where a loop may pause for half of it."""
 PATIENT_LIMITS = limits_text(watchdog_s=PATIENT_S)
 
 

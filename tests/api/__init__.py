@@ -1,1 +1,1 @@
-"""The front door."""
+"""Tests of the Python API."""

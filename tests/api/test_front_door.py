@@ -1,4 +1,4 @@
-"""The Python API: the same documents as the command line's, the same guard, stop and confirmation."""
+"""Python API: the same documents as on the command line, and the same guard, stop and confirmation."""
 
 import contextlib
 import json
@@ -47,7 +47,7 @@ def test_importing_it_loads_nothing():
     assert done.stdout.strip() == "[]"
 
 
-def test_every_name_that_it_promises_is_there():
+def test_every_public_name_exists():
     for name in tdhil.__all__:
         assert getattr(tdhil, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
@@ -57,7 +57,7 @@ def test_every_name_that_it_promises_is_there():
 @pytest.mark.long(but_first=2)
 @pytest.mark.heavy
 @pytest.mark.parametrize("first", ["tdhil", "tdhil.runner", "tdhil.runner.guard", "tdhil.api"])
-def test_run_is_called_whatever_was_loaded_before(first):
+def test_run_is_callable_after_any_imports(first):
     code = f"import {first}, tdhil\ntry: tdhil.run(tdhil.simulate(seed=7).__enter__(), no_guard=True)\n"
     code += "except tdhil.TdhilError as err: print(err)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -65,7 +65,7 @@ def test_run_is_called_whatever_was_loaded_before(first):
 
 
 @pytest.mark.heavy
-def test_a_run_is_read_back_as_it_was(record):
+def test_a_run_is_read_back_unchanged(record):
     again = tdhil.read(record.log)
     assert (again.recording.time_s == record.recording.time_s).all()
     assert (again.recording.torque_nm == record.recording.torque_nm).all()
@@ -113,7 +113,7 @@ def test_a_trace_in_csv_takes_the_options_of_replay(record, capsys, tmp_path):
 
 
 @pytest.mark.heavy
-def test_what_ends_a_run_is_raised_once_the_shaft_rests(tmp_path):
+def test_the_cause_of_an_abort_is_raised_at_standstill(tmp_path):
     with tdhil.simulate(seed=7, faults=["sto@speed+15s"]) as drive, pytest.raises(tdhil.TdhilError) as caught:
         tdhil.run(drive, SHORT, log="broken.mcap")
     assert "log: broken.mcap" in caught.value.__notes__
@@ -121,7 +121,7 @@ def test_what_ends_a_run_is_raised_once_the_shaft_rests(tmp_path):
     assert not tdhil.read("broken.mcap").whole
 
 
-def test_what_was_refused_before_motion_is_said_and_leaves_the_last_log():
+def test_a_refusal_before_motion_is_raised_and_keeps_the_last_log():
     with tdhil.simulate(seed=7) as drive, pytest.raises(PreflightRefused, match="plan of stage 5"):
         tdhil.run(drive, tdhil.Multisine(amplitude_rad_s=1000.0), log="none.mcap")
     assert not Path("none.mcap").exists()
@@ -132,7 +132,7 @@ def test_what_was_refused_before_motion_is_said_and_leaves_the_last_log():
     ({"faults": ["nonsense"]}, "no fault is called"),
     ({"profile": "nobody/nothing"}, "nobody/nothing"),
 ])
-def test_what_can_t_be_is_said_when_the_drive_is_named(wrong, said):
+def test_impossible_values_are_reported_when_the_drive_is_named(wrong, said):
     with pytest.raises(tdhil.TdhilError, match=said), tdhil.simulate(seed=7, **wrong):
         pass
 
@@ -142,7 +142,7 @@ def test_what_can_t_be_is_said_when_the_drive_is_named(wrong, said):
     ({"node": 300}, "node: "),
     ({"real_time": True, "stepped": True}, "stepped"),
 ])
-def test_an_option_is_named_as_python_calls_it(tmp_path, wrong, said):
+def test_an_option_has_its_python_name(tmp_path, wrong, said):
     rig = rig_file(tmp_path, "run: {seed: 7}\n")
     with pytest.raises(UsageError) as caught, tdhil.open_drive(rig, **wrong):
         pass
@@ -150,7 +150,7 @@ def test_an_option_is_named_as_python_calls_it(tmp_path, wrong, said):
 
 
 @pytest.mark.heavy
-def test_values_that_can_t_be_are_named_as_python_calls_them(record, tmp_path, capsys):
+def test_impossible_values_have_their_python_names(record, tmp_path, capsys):
     with pytest.raises(UsageError, match="confidence") as caught:
         tdhil.identify(record, confidence=7.0)
     assert "--confidence" not in str(caught.value)
@@ -175,7 +175,7 @@ def test_a_drive_is_named_without_a_motion_being_planned(tmp_path):
 
 
 class AskedLater(tdhil.StopRequest):
-    """Asks by itself once it was looked at so often: a moment that no clock decides."""
+    """Stop request that triggers after a number of checks, independent of any clock."""
 
     polls = 1500
 
@@ -190,7 +190,7 @@ class AskedLater(tdhil.StopRequest):
 
 
 @pytest.mark.heavy
-def test_a_run_in_a_thread_is_stopped_by_its_request_and_leaves_the_signals_alone(tmp_path):
+def test_a_run_in_a_thread_is_stopped_by_its_request_without_changes_of_signals(tmp_path):
     former = signal.getsignal(signal.SIGINT)
     handlers = set()
 
@@ -207,7 +207,7 @@ def test_a_run_in_a_thread_is_stopped_by_its_request_and_leaves_the_signals_alon
     assert recording.speed_rad_s.max() > 0.4 and abs(recording.speed_rad_s[-1]) < 0.1
 
 
-def test_a_request_of_ones_own_hears_of_signals_too_in_the_main_thread():
+def test_an_own_request_also_receives_signals_in_the_main_thread():
     mine = tdhil.StopRequest()
     with stop_on_signals(mine) as request:
         assert request is mine
@@ -218,13 +218,13 @@ def test_a_request_of_ones_own_hears_of_signals_too_in_the_main_thread():
     assert other.signum == signal.SIGINT
 
 
-def test_an_option_that_is_not_there_is_refused():
+def test_an_unknown_option_is_refused():
     with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match="unknown option: no_guard"):
         tdhil.run(drive, SHORT, no_guard=True)
 
 
 class Asked:
-    """A real drive's preflight, as far as a confirmation looks at it."""
+    """Preflight of a real drive, with the fields that a confirmation uses."""
 
     def __init__(self):
         self.cycles = 0
@@ -281,7 +281,7 @@ def test_a_confirmation_that_fails_moves_nothing_and_feeds_the_watchdog(real_pre
     assert asked.cycles > 0
 
 
-def test_without_a_terminal_nobody_confirms(real_preflight, monkeypatch):
+def test_without_a_terminal_there_is_no_confirmation(real_preflight, monkeypatch):
     from tdhil.report.console import stderr_console
 
     monkeypatch.setattr("sys.stdin", None)

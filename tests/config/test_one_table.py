@@ -1,4 +1,4 @@
-"""An option is declared once: one line in the table, and every place that takes options has it; no other file names it.
+"""An option is declared once, in one line of the table. Every place with options has it, and no other file names it.
 
 The first test adds a line to a copy of the package and looks in all six places. The last ones read every source file.
 """
@@ -102,7 +102,7 @@ def test_an_option_is_added_in_one_line_and_is_there_in_all_six_places(tmp_path)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Each place, by itself
+# Each place alone
 
 
 def test_the_page_on_rig_yaml_is_what_the_table_makes_of_it():
@@ -122,7 +122,7 @@ def test_help_fits_a_terminal(command, capsys, monkeypatch):
     assert [line for line in text.splitlines() if len(line) > 80 and not one_word.fullmatch(line)] == []
 
 
-def test_every_option_has_a_sentence_and_a_flag_of_its_own():
+def test_every_option_has_its_own_sentence_and_flag():
     assert all(option.help and option.flag.startswith("--") for option in OPTIONS)
     assert len({option.flag for option in OPTIONS}) == len({option.keyword for option in OPTIONS}) == len(OPTIONS)
     assert all("{" not in option.help_text for option in OPTIONS)
@@ -150,7 +150,7 @@ def test_python_shows_its_keywords():
     assert set(identify) == {"recorded", "model", "confidence", "tolerance"}
 
 
-def test_a_keyword_that_no_option_has_is_refused_with_those_that_there_are():
+def test_an_unknown_keyword_is_refused_with_the_known_ones():
     with pytest.raises(tdhil.TdhilError, match="unknown option: sed") as caught, tdhil.simulate(sed=7):
         pass
     assert "seed" in str(caught.value)
@@ -164,7 +164,7 @@ def test_the_forms_have_every_excitation_and_model():
 
 
 def test_a_log_without_settings_of_its_own_has_the_documented_tolerance(monkeypatch):
-    """0.05, of docs/reference/rig.md and the help of replay; it was 0.02 there."""
+    """It is 0.05, as in docs/reference/rig.md and the help of replay. It used to be 0.02."""
     from tdhil import estimation
     from tdhil.session.conclusion import conclude
 
@@ -195,8 +195,11 @@ ORDINARY = {word for word in NAMES if word.isalpha()} | {
     *BUSES, "torque", "speed", "offset", "reference", "string", "step", "paper", "auto", "rigid",
     "rate_hz", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "speed_unit",
 }
-"""Plain words and quantities, which Python files also have as keys of a document, as signals, as stages: looked for in
-pages and scripts alone. Buses: `tests/config/test_registry.py` sees to it that nothing compares with their names."""
+"""Plain words and quantities, searched in pages and scripts only.
+
+Python files also use them as keys of a document, as signals or as stages. For buses, `tests/config/test_registry.py`
+checks that no code compares with their names.
+"""
 
 EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
     "api.py": ("classes of the motions that ship, for their users", {"coast-down", "pulses", "multisine", "sine"}),
@@ -248,11 +251,11 @@ EXCEPTIONS: dict[str, tuple[str, set[str]]] = {
             "drive", "log", "note", "operator", "profile", "rate", "speed", "torque", "trace"}),
     "service/templates/run.html": ("what was seen, for a sign-off", {"note"}),
 }
-"""File → (reason, names that may stand in it)."""
+"""File → (reason, names that it may contain)."""
 
 
 def stated(path: Path) -> Iterator[str]:
-    """Names in a source file: whole texts of a Python file; of a page or a script also fields and properties."""
+    """Return the names in a source file: texts of a Python file; in a page or script fields and properties too."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
         for node in ast.walk(ast.parse(text)):
@@ -278,11 +281,11 @@ def test_no_name_of_an_option_stands_in_a_second_file(file):
         return
     allowed = EXCEPTIONS.get(file, ("", set()))[1]
     found = {name for name in stated(PACKAGE / file) if name in NAMES | CHOICES}
-    assert found - allowed == set(), "an option is declared in tdhil/config/options.py alone: take it from OPTION"
-    assert allowed - found == set(), "an exception that nothing needs"
+    assert found - allowed == set(), "an option is declared only in tdhil/config/options.py: take it from OPTION"
+    assert allowed - found == set(), "an unused exception"
 
 
-def test_no_flag_of_the_statement_stands_in_a_second_file():
+def test_no_flag_of_the_statement_is_in_a_second_file():
     flags = {one.flag for one in OF_EVIDENCE} - {one.flag for one in OPTIONS}
     assert len(flags) == len(OF_EVIDENCE)
     there = {file for file in FILES for flag in flags

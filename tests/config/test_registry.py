@@ -1,6 +1,6 @@
-"""What can be chosen stands in one list each: a toy that is put into the list is there for everybody.
+"""One list for each kind of choice: a toy that is added to the list is available everywhere.
 
-Everything that a toy needs stands in this file, and one line puts it in; nothing else of the tree is touched.
+All code of a toy is in this file, and one line adds it. No other file of the tree changes.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.usefixtures("toys")
-def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
+def test_a_toy_excitation_is_run_by_the_python_api_and_identified(tmp_path):
     with tdhil.simulate(seed=7) as drive:
         recording = tdhil.run(drive, tdhil.Motion("two-tones", periods=5), log=tmp_path / "run.mcap")
     excitation = recording.recording.excitation
@@ -107,7 +107,7 @@ def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
 @pytest.mark.heavy
 @pytest.mark.usefixtures("toys")
 @pytest.mark.parametrize(("kind", "motion"), [("two-tones", "segments"), ("stairs", "ways")])
-def test_a_toy_excitation_is_taken_by_the_command_line_and_rig_yaml(kind, motion, tmp_path, capsys):
+def test_a_toy_excitation_is_accepted_by_the_command_line_and_rig_yaml(kind, motion, tmp_path, capsys):
     rig = rig_file(tmp_path, f"run: {{excitation: {kind}}}\n")
     assert load_rig(rig).run.excitation == kind
     for words in (["--excitation", kind], ["--rig", str(rig)]):
@@ -117,7 +117,7 @@ def test_a_toy_excitation_is_taken_by_the_command_line_and_rig_yaml(kind, motion
 
 
 @pytest.mark.usefixtures("toys")
-def test_what_a_toy_excitation_says_of_itself_is_heeded():
+def test_the_properties_of_a_toy_excitation_are_used():
     assert adaptive(ExcitationRequest("two-tones", tolerance=0.01))
     assert not adaptive(ExcitationRequest("stairs", tolerance=0.01))
     planned = plan_acquisition(ExcitationRequest("stairs"), "torque", LIMITS, GUESS, KNOWN, math.inf)
@@ -131,7 +131,7 @@ def test_what_a_toy_excitation_says_of_itself_is_heeded():
 
 
 @pytest.mark.usefixtures("toys")
-def test_a_trace_may_have_been_excited_by_a_toy_that_is_periodic():
+def test_a_trace_may_have_a_periodic_toy_excitation():
     segment = "\nsegments: [{start_s: 0, periods: 3, period_s: 10, offset_rad_s: 2, lines_hz: [0.1, 0.3]}]\n"
     assert parse_model(f"kind: two-tones{segment}", "excitation.yaml", ExcitationFile).kind == "two-tones"
     with pytest.raises(DataFileError, match=r"'multisine', 'sine', 'step'.* or 'two-tones'"):
@@ -139,11 +139,11 @@ def test_a_trace_may_have_been_excited_by_a_toy_that_is_periodic():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A model of the shaft: its mechanics in a file of their own, and one line in the list
+# A model of the shaft: its mechanics in its own file, and one line in the list
 
 
 class StiffJoint(TwoMassShaft):
-    """Two masses on a spring that a joint makes stiffer: another shaft, with its own name."""
+    """Two masses on a spring that a joint makes stiffer: a further shaft with its own name."""
 
     def scales(self, rough_inertia: float, s: Any) -> Any:
         return np.multiply(super().scales(rough_inertia, s), 1.0)
@@ -173,14 +173,14 @@ def test_a_toy_shaft_is_fitted_by_name(monkeypatch):
 
 
 class FlywheelParams(ShaftParams):
-    """The toy's section in plant.yaml."""
+    """Section of the toy in plant.yaml."""
 
     kind: Literal["flywheel"] = "flywheel"
     wheel_kg_m2: Positive = 10.0
 
 
 class Flywheel(plants.Rigid):
-    """More inertia on a rigid shaft."""
+    """Rigid shaft with additional inertia."""
 
     def __init__(self, params: FlywheelParams) -> None:
         same = {name: getattr(params, name) for name in ShaftParams.model_fields}
@@ -223,7 +223,7 @@ def test_every_excitation_is_what_its_entry_says():
 
 @pytest.mark.parametrize("registry", [EXCITATIONS, MODELS, BUSES], ids=["excitations", "models", "buses"])
 @pytest.mark.parametrize("wrong", ["multisin", "", 3, None, ["sine"], {}, True])
-def test_a_wrong_name_is_refused_as_a_literal_is(registry, wrong):
+def test_a_wrong_name_is_refused_like_a_literal(registry, wrong):
     ours = TypeAdapter(Annotated[str, Registered(registry)])
     theirs: TypeAdapter[Any] = TypeAdapter(Literal[tuple(registry)])    # type: ignore[valid-type]
     found = []
@@ -235,7 +235,7 @@ def test_a_wrong_name_is_refused_as_a_literal_is(registry, wrong):
     assert ours.json_schema()["enum"] == theirs.json_schema()["enum"] == names(registry)
 
 
-def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
+def test_a_wrong_name_at_an_input_lists_the_choices(tmp_path, capsys):
     with pytest.raises(DataFileError, match=r"rig.yaml:2: run.excitation: must be 'multisine', .* or '[a-z-]+', "
                                             r"not the text 'multisin'; did you mean 'multisine'\?"):
         loaded_rig(tmp_path, "run:\n  excitation: multisin\n")
@@ -251,7 +251,7 @@ def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
 def test_no_chain_of_excitations_or_models_is_left():
     chains = []
     for path in sorted((ROOT / "tdhil").rglob("*.py")):
-        if "studies" in path.parts:     # the paper's own signals, whatever a run can do
+        if "studies" in path.parts:     # the signals of the paper, independent of those of a run
             continue
         apart = set(EXCITATIONS) | (set(MODELS) if "estimation" in path.parts else set())
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -262,7 +262,7 @@ def test_no_chain_of_excitations_or_models_is_left():
     assert chains == []
 
 
-def test_the_usual_durations_are_those_of_the_stages_and_stand_in_one_place():
+def test_the_usual_durations_are_those_of_the_stages_and_in_one_place():
     assert tuple(USUAL_STAGE_S) == STAGES
     again = re.compile(r'"setup": [\d.]+, *"speed": [\d.]+')
     assert [path.name for path in (ROOT / "tdhil").rglob("*.py") if again.search(path.read_text("utf-8"))] == [

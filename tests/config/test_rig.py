@@ -1,4 +1,4 @@
-"""rig.yaml: what it takes, what it refuses and in which line, and whose word counts."""
+"""rig.yaml: accepted entries, refusals with their line, and precedence of sources."""
 
 from pathlib import Path
 
@@ -88,7 +88,7 @@ def test_everything_has_its_place(tmp_path: Path) -> None:
         assert not option.at or rig.get(option.at) is not None, f"{option.at} is missing in FULL"
 
 
-def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
+def test_an_almost_empty_rig_is_sufficient(tmp_path: Path) -> None:
     rig = loaded_rig(tmp_path, "node: 3\n")
     assert rig.limits is None
     assert (rig.gear.ratio, rig.load.kind, rig.allow_reverse) == (1.0, "none", False)
@@ -129,7 +129,7 @@ def test_what_is_refused(tmp_path: Path, old: str, new: str, line: int, words: s
     assert any(at == line and words in message for at, message in found), found
 
 
-def test_problems_across_keys_come_together(tmp_path: Path) -> None:
+def test_problems_across_keys_are_reported_together(tmp_path: Path) -> None:
     text = FULL.replace("torque_ramp_nm_s: 50\n", "").replace("make_up_torque_nm: 900", "make_up_torque_nm: 300")
     assert [line for line, _ in problems(tmp_path, text)] == [9, 16]
 
@@ -174,7 +174,7 @@ def test_every_option_can_stand_in_the_rig(tmp_path: Path) -> None:
     assert all(found.source(option.name).startswith("rig.yaml:") for option in OPTIONS if option.at)
 
 
-def test_what_is_accepted_in_both_places_counts_once(tmp_path: Path) -> None:
+def test_an_override_in_both_places_counts_once(tmp_path: Path) -> None:
     rig = loaded_rig(tmp_path, "accept_unverified: [watchdog, likely]\n")
     found = resolve({"accept_unverified": ["speed", "watchdog"]}, rig)
     assert found.accept_unverified == ("speed", "watchdog", "likely")
@@ -183,7 +183,7 @@ def test_what_is_accepted_in_both_places_counts_once(tmp_path: Path) -> None:
     assert resolve({}, None).accept_unverified == ()
 
 
-def test_files_named_in_the_rig_lie_beside_it(tmp_path: Path) -> None:
+def test_files_named_in_the_rig_are_relative_to_it(tmp_path: Path) -> None:
     found = resolve({}, loaded_rig(tmp_path, FULL))
     assert found.plant == str(tmp_path / "plant.yaml")
     assert found.profile == str(tmp_path / "mine.yaml")
@@ -192,7 +192,7 @@ def test_files_named_in_the_rig_lie_beside_it(tmp_path: Path) -> None:
     assert (found.plant, found.profile) == ("p.yaml", "generic/cia402")
 
 
-def test_the_clock_of_the_command_line_undoes_the_rigs(tmp_path: Path) -> None:
+def test_the_clock_of_the_command_line_replaces_the_rigs(tmp_path: Path) -> None:
     found = resolve({"stepped": True}, loaded_rig(tmp_path, FULL))
     assert (found.stepped, found.real_time, found.source("real_time")) == (True, False, "--stepped")
 
@@ -236,13 +236,13 @@ def test_a_string_may_be_a_word_or_a_pipe_with_its_sizes(tmp_path):
     ("{kind: none, length_m: 2300}", "belongs to kind: string"),
     ("{kind: string, lenght_m: 2300}", "lenght_m"),
 ])
-def test_a_load_that_is_none_is_refused_with_its_line(load, said, tmp_path):
+def test_an_invalid_load_is_refused_with_its_line(load, said, tmp_path):
     with pytest.raises(DataFileError, match=said) as refused:
         loaded_rig(tmp_path, f"node: 5\nload: {load}\n" + STRING_KEYS)
     assert "rig.yaml:2" in str(refused.value)
 
 
-def test_the_pipe_is_what_its_sizes_make_of_steel_at_the_motor(tmp_path):
+def test_the_pipe_follows_from_its_dimensions_at_the_motor(tmp_path):
     pipe = "load: {kind: string, length_m: 3000, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}\n"
     found = pipe_of(loaded_rig(tmp_path, "gear: {ratio: 2}\n" + pipe + STRING_KEYS))
     assert 4.0 * found.impedance_nm_s_rad == pytest.approx(296.5, rel=1e-3)

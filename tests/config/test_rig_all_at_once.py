@@ -1,4 +1,4 @@
-"""Every mistake of a rig.yaml at once: contradictions between keys stand beside mistakes in others."""
+"""All errors of a rig.yaml at once: contradictions between keys together with errors of other keys."""
 
 import pytest
 from hypothesis import given
@@ -12,7 +12,7 @@ from tests.rigs import limits_text, loaded_rig
 
 
 def rig_text(limits=(), **top):
-    """One line a key, so that each mistake has a line of its own; None takes a key out."""
+    """Return a rig with one line per key, so that each error has its own line. None removes a key."""
     return "".join(f"{key}: {value}\n" for key, value in top.items()) + limits_text(**dict(limits))
 
 
@@ -43,7 +43,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("said", CROSS)
-def test_a_contradiction_stands_beside_another_mistake(tmp_path, said, other):
+def test_a_contradiction_is_reported_beside_another_error(tmp_path, said, other):
     top = {
         "rate_hz": "100", "load": "string" if "string" in said else "none", "make_up_torque_nm": "29000",
         "run": "{real_time: true, stepped: true}" if "real_time" in said else "{seed: 1}",
@@ -56,15 +56,15 @@ def test_a_contradiction_stands_beside_another_mistake(tmp_path, said, other):
     assert len(found) == 2, found
 
 
-def test_two_contradictions_and_a_mistake_in_the_same_section(tmp_path):
+def test_two_contradictions_and_an_error_in_the_same_section(tmp_path):
     limits = (("speed_min_rad_s", "-2"), ("probe_torque_nm", "500"), ("time_s", "soon"), ("speed_max_rad_s", "-3"))
     found = problems(tmp_path / "rig.yaml", rig_text(limits))
     for said in ("needs allow_reverse", "probe_torque_nm: must not be above", "time_s", "speed_max_rad_s: must be"):
         assert sum(said in text for text in found) == 1, found
-    assert not any("must be below speed_max" in text for text in found)        # of a highest speed that is none
+    assert not any("must be below speed_max" in text for text in found)        # for an invalid highest speed
 
 
-def test_nothing_is_made_up_of_what_is_wrong_itself(tmp_path):
+def test_no_contradiction_is_reported_for_a_wrong_value(tmp_path):
     found = problems(tmp_path / "rig.yaml", rig_text(
         (("speed_min_rad_s", "-2"), ("torque_nm", "much")), allow_reverse="perhaps", load="string",
         make_up_torque_nm="29000", torque_ramp_nm_s="slow", drive_data="{speed_lag_s: long, speed_lag_sd_s: 0.1}",
@@ -73,7 +73,7 @@ def test_nothing_is_made_up_of_what_is_wrong_itself(tmp_path):
     assert not any("needs" in text or "must not" in text for text in found)
 
 
-def test_a_key_that_is_missing_takes_no_check_of_others_along(tmp_path):
+def test_a_missing_key_suppresses_no_other_check(tmp_path):
     found = problems(tmp_path / "rig.yaml", rig_text((("time_s", None), ("probe_torque_nm", "500"))))
     assert any("'time_s' is missing" in text for text in found)
     assert any("probe_torque_nm: must not be above" in text for text in found)
@@ -81,7 +81,7 @@ def test_a_key_that_is_missing_takes_no_check_of_others_along(tmp_path):
 
 @pytest.mark.heavy
 @given(st.sets(st.sampled_from(["window", "probe", "reverse", "watchdog"])), st.booleans())
-def test_what_is_told_does_not_depend_on_another_mistake(tmp_path_factory, wrong, beside):
+def test_a_report_does_not_depend_on_another_error(tmp_path_factory, wrong, beside):
     limits = {
         "window": ("speed_max_rad_s", "0.1"), "probe": ("probe_torque_nm", "500"), "reverse": ("speed_min_rad_s", "-2"),
         "watchdog": ("watchdog_s", "0.02"),
@@ -105,7 +105,7 @@ OTHER_BUS = {
 
 
 @pytest.mark.parametrize("text", OTHER_BUS)
-def test_a_place_on_the_other_bus_is_no_wish_for_the_simulator(tmp_path, no_bus_of_the_user, text):
+def test_an_address_on_the_other_bus_does_not_select_the_simulator(tmp_path, no_bus_of_the_user, text):
     rig = loaded_rig(tmp_path, text)
     with pytest.raises(DataFileError) as caught:
         connection_of({}, rig, resolve({}, rig))
@@ -116,7 +116,7 @@ def test_a_place_on_the_other_bus_is_no_wish_for_the_simulator(tmp_path, no_bus_
     assert "--simulate" in problem.message
 
 
-def test_it_is_taken_where_somebody_says_what_is_meant(tmp_path, no_bus_of_the_user):
+def test_it_is_accepted_with_an_explicit_choice(tmp_path, no_bus_of_the_user):
     rig = loaded_rig(tmp_path, "drive: canopen\nmodbus: {host: 192.0.2.10}\n")
     for cli in ({"simulate": True}, {"drive": "modbus"}, {"interface": "virtual", "channel": "a"}):
         connection_of(cli, rig, resolve(cli, rig))

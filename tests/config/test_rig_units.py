@@ -1,4 +1,4 @@
-"""rig.yaml in the units of the manuals: converted and shown, or refused; never taken for a bare number."""
+"""rig.yaml in the units of the manuals: converted and shown, or refused, but never read as a bare number."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_the_dry_run_shows_both(tmp_path, capsys):
     assert ["run.tolerance", "5% = 0.05", "rig.yaml:10"] in converted
 
 
-def test_files_whose_reader_shows_nothing_are_told_what_it_is(tmp_path):
+def test_in_files_without_a_conversion_the_message_states_the_value(tmp_path):
     with pytest.raises(DataFileError, match=r"'100 rpm' is 10\.471975512 rad/s; write limits\.speed_max_rad_s as"):
         load_model(rig(tmp_path, {"speed_max_rad_s": "100 rpm"}), Rig)
 
@@ -120,7 +120,7 @@ def test_the_command_line_and_the_environment_know_the_same_rates(monkeypatch, t
         can_line({"interface": "socketcan"})
 
 
-def test_options_take_units(capsys):
+def test_options_accept_units(capsys):
     import argparse
 
     from tdhil.cli.identify import add_arguments

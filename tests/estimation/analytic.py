@@ -1,4 +1,4 @@
-"""Recordings in closed form: exact lines of an exact transfer function, with a small seeded disturbance on top."""
+"""Recordings in closed form: exact lines of an exact transfer function, plus a small seeded disturbance."""
 
 import numpy as np
 
@@ -27,11 +27,11 @@ def closed_form(
     unrecorded_s=0.0,
     phases_rad=None,
 ):
-    """``phases_rad``: of the lines, one row for each segment; None: the same in all of them.
+    """Return a recording. ``phases_rad``: phases of the lines, one row per segment; None: the same in all segments.
 
-    ``noise``: sd of white torque per sample, N·m, on the reported torque. ``unrecorded_s``: pause between segments.
+    ``noise``: sd of white noise of the reported torque per sample, N·m. ``unrecorded_s``: pause between segments.
 
-    The closed form has no torque that would change the mean speed: without a pause its balance of momentum is false.
+    The closed form has no torque for changes of the mean speed. Without a pause, its momentum balance is false.
     """
     rng = np.random.default_rng(seed)
     omega = 2.0 * np.pi * np.array(lines)

@@ -11,12 +11,12 @@ from tests.estimation.stages_bench import Play, Stages, turn
 RATED_NM = 400.0
 """Rated torque of the bench's rig: its torque limit."""
 COUNTS = 8192
-EVERY = 5              # samples of speed and torque for one of the angle, as a second TPDO brings it
+EVERY = 5              # samples of speed and torque per sample of the angle, as with a second TPDO
 
 
 @dataclass(frozen=True)
 class OverAngle:
-    """What differs from the usual run of `stages_bench`."""
+    """Differences from the usual run of `stages_bench`."""
 
     rig: Rig = field(default_factory=Rig)
     periods: int = 6
@@ -27,7 +27,7 @@ class OverAngle:
 
 
 def run_over_angle(bench: OverAngle, seeds: list[int]) -> list[Recording]:
-    """One recording per seed, with the angle as counted once in ``every`` samples."""
+    """Return one recording per seed, with the counted angle once in ``every`` samples."""
     stages = Stages(rig=bench.rig, periods=bench.periods, static=bench.static, play=bench.play)
     motion, shaft, reported = turn(stages, seeds)
     found = recordings(bench.rig, motion, replace(shaft, torque=reported), seeds, rate_hz=bench.rate_hz)

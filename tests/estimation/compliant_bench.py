@@ -1,10 +1,10 @@
-"""A bench of our own for shafts that are not rigid: motor, spring or string, and drive reports, in plain numpy.
+"""Independent bench for shafts that are not rigid: motor, spring or string, and drive reports, in plain numpy.
 
-It shares no code with what it tests, nor with sim_bus. Many seeds run at once, one column each. Two masses are stepped
-by the exact solution of their linear equations over 10 ms (friction as it stands at the beginning of the step); the
-string's waves are moved cell by cell along the pipe. Torque is fed forward from the truth, with a slow PI on the mean
-speed; the reports go through first-order lags. The noise is what makes the Cramér-Rao bounds of the two-mass design
-those of the notes: J_r 0.3 %, J_L and k 4 %, c 25 % with the lags known, 1.6, 4, 4 and 35 % with them estimated.
+It shares no code with the tested code or sim_bus. Many seeds run at once, one column each. Two masses are stepped
+by the exact solution of their linear equations over 10 ms, with the friction at the beginning of the step. The
+waves of the string move cell by cell along the pipe. Torque is fed forward from the truth, with a slow PI on the mean
+speed. The reports have first-order lags. With this noise, the Cramér-Rao bounds of the two-mass design are
+J_r 0.3 %, J_L and k 4 %, c 25 % with known lags, and 1.6, 4, 4 and 35 % with estimated lags.
 """
 
 import cmath
@@ -20,7 +20,7 @@ PERIOD_S = 20.0
 LINES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9)
 PHASES = (0.3, 2.1, 5.2, 1.1, 3.9, 0.2, 4.4, 2.7, 5.9, 1.6, 3.3)
 OFFSETS = (3.2, 5.7)
-FADE_S = 20.0                          # the excitation grows over so long, for a swing takes minutes to die down
+FADE_S = 20.0                          # rise time of the excitation, since an oscillation decays within minutes
 MOST_SWING_RAD_S = 0.8                 # of the load, at one line
 SETTLE, USED = 4, 6                    # periods about each mean speed: 240 s used
 
@@ -51,7 +51,7 @@ class TwoMass:
         return self.motor + self.load
 
     def impedance(self, hz: float) -> complex:
-        """From the equations of motion, solved for the two speeds at T = 1."""
+        """Return the impedance from the equations of motion, solved for the two speeds at T = 1."""
         s = 2j * cmath.pi * hz
         spring = self.stiffness / s + self.damping
         matrix = np.array([
@@ -61,7 +61,7 @@ class TwoMass:
         return complex(1.0 / np.linalg.solve(matrix, np.array([1.0, 0.0]))[0])
 
     def swing(self, hz: float) -> float:
-        """The load's speed as a multiple of the motor's."""
+        """Return the ratio of the load's speed to the motor's."""
         s = 2j * cmath.pi * hz
         spring = self.stiffness / s + self.damping
         return abs(spring / (self.load * s + self.load_viscous + spring))
@@ -72,7 +72,7 @@ class TwoMass:
 
 @dataclass(frozen=True)
 class Pipe:
-    """A string of `inertia` and static `stiffness`; the rest at its ends."""
+    """String with `inertia` and static `stiffness`; the other parameters describe its ends."""
 
     motor: float = 1500.0
     end: float = 374.0
@@ -95,7 +95,7 @@ class Pipe:
         return float(np.sqrt(self.inertia / self.stiffness))
 
     def impedance(self, hz: float) -> complex:
-        """Telegraph equation, from the waves at either end."""
+        """Return the impedance by the telegraph equation, from the waves at both ends."""
         s = 2j * cmath.pi * hz
         shunt, series = self.inertia * s + self.drag, s / self.stiffness
         gamma, wave = cmath.sqrt(shunt * series), cmath.sqrt(shunt / series)
@@ -104,7 +104,7 @@ class Pipe:
         return self.motor * s + self.motor_viscous + wave * (1.0 + back) / (1.0 - back)
 
     def swing(self, hz: float) -> float:
-        """The end's speed as a multiple of the motor's."""
+        """Return the ratio of the speed at the lower end to the motor's."""
         s = 2j * cmath.pi * hz
         shunt, series = self.inertia * s + self.drag, s / self.stiffness
         gamma, wave = cmath.sqrt(shunt * series), cmath.sqrt(shunt / series)
@@ -115,7 +115,7 @@ class Pipe:
 
 
 class _TwoMassBody:
-    """ω_r, ω_L, twist; in steady rotation to begin with."""
+    """State of two masses: ω_r, ω_L and twist, first in steady rotation."""
 
     def __init__(self, plant: TwoMass, many: int, speed: float, dry: tuple[float, float]) -> None:
         from scipy.signal import cont2discrete
@@ -133,7 +133,7 @@ class _TwoMassBody:
         self.state = np.tile([[speed], [speed], [held]], (1, many))
 
     def step(self, torque: np.ndarray) -> np.ndarray:
-        """The motor's speed before the step."""
+        """Advance by one step; return the motor speed before it."""
         speed = self.state[0]
         friction = np.sign(self.state[1]) * self.dry[1]
         forces = np.stack([torque - self.dry[0] * np.sign(speed), -friction])
@@ -148,7 +148,7 @@ class _PipeBody:
         self.p, self.dry = plant, dry
         self.cells = round(plant.delay / DT)
         delay = self.cells * DT
-        # the delay is made whole in cells by a hair's breadth of stiffness
+        # a small change of stiffness makes the delay a whole number of cells
         self.wave = plant.inertia / delay
         self.beta = plant.drag / self.cells
         self.motor = np.full(many, speed)
@@ -198,7 +198,7 @@ def run(
     rng = [np.random.default_rng(seed) for seed in seeds]
     phases = np.array(PHASES[: len(lines)])
     z = np.array([plant.impedance(hz) for hz in lines])
-    # the load must not turn back where it swings by itself: its friction would
+    # the load must not reverse during its own oscillation, since its friction would reverse too
     amplitudes = np.array([min(amplitude, MOST_SWING_RAD_S / plant.swing(hz)) for hz in lines])
     ramp_s, dry = 10.0, (60.0, 30.0)
     time = np.arange(round((2 * length + ramp_s) / DT)) * DT

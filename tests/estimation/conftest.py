@@ -5,7 +5,7 @@ SEEDS = list(range(24))
 
 @pytest.fixture(scope="session")
 def default_run():
-    """The default plan on the field-like rig, 24 seeds at once: rig, motion, plan, what truly happened."""
+    """Return the default plan on the field-like rig for 24 seeds: rig, motion, plan, true motion."""
     from tests.estimation.planned_motions import planned
     from tests.estimation.shaft_bench import Rig, turn_shaft
 

@@ -1,4 +1,4 @@
-"""Ways in which a record can be hopeless, faulty or malformed, by name: each spoils a sound one with a seed."""
+"""Kinds of unusable, faulty or malformed records, by name. Each makes one from a good record, with a seed."""
 
 from tests.estimation.hopeless_family import families
 from tests.estimation.hopeless_motions import MOTIONS
@@ -12,7 +12,7 @@ RECORD_FAULTS = [f for f in SINGLE if f.spoil is not None and f.name not in ("wo
 
 @family()
 def two_faults(r, rng):
-    """Two at random, one upon the other."""
+    """Apply two random faults, one after the other."""
     for number in rng.choice(len(RECORD_FAULTS), 2, replace=False):
         if r.excitation is None or not r.excitation.segments or len(r.time_s) < 3000:
             break

@@ -1,7 +1,7 @@
-"""A family of hopeless records: a name, what it does to a sound one with a seed, and what must be said of it.
+"""Family of unusable records: a name, its change of a good record with a seed, and the required message.
 
-A family says which words the reason or a warning must have, where the fault can be recognised; those that can only be
-refused, or let through with a warning because the interval still covers, have none.
+If the fault can be recognised, the family states words of the reason or warning. Families without words are refused,
+or accepted with a warning because the interval still covers.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from tests.estimation.hopeless_shaft import LEAD_S, PERIOD_S, PERIODS, Trouble
 
 @dataclass(frozen=True)
 class Family:
-    """``trouble``: what happens to the shaft; ``spoil``: to the record; ``said``: one of these must be said."""
+    """Family. ``trouble``: fault of the shaft. ``spoil``: fault of the record. ``said``: one of the required words."""
 
     name: str
     said: tuple[str, ...]
@@ -23,7 +23,7 @@ class Family:
 
 
 def families():
-    """(a list; decorators that put into it what happens to the record, and what happens to the shaft)."""
+    """Return a list, and decorators that add a fault of the record or of the shaft to it."""
     kept: list[Family] = []
 
     def family(*said: str, trouble=None):
@@ -54,5 +54,5 @@ def declaring(r, **changes):
 
 
 def moment(rng):
-    """A second within the excitation of the first segment, after settling."""
+    """Return a time within the excitation of the first segment, after settling."""
     return LEAD_S + PERIOD_S + rng.uniform(0.0, (PERIODS - 2) * PERIOD_S)

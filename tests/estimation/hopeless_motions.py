@@ -1,4 +1,4 @@
-"""Columns and signs, motion other than declared, sampling, friction, and what goes with a record."""
+"""Columns and signs, motion that differs from the declaration, sampling, friction, and data beside a record."""
 
 from dataclasses import replace
 
@@ -29,12 +29,12 @@ def speed_twice(r, rng):
     return replace(r, torque_nm=r.speed_rad_s)
 
 
-# -- other motion than was declared --------------------------------------------------------------------------
+# -- motion that differs from the declaration --------------------------------------------------------------------------
 
 
 @family()
 def no_excitation_and_no_motion(r, rng):
-    """Steady speed with noise: without a word of what was run, there is nothing to go by."""
+    """Steady speed with noise and without a declared motion: there is no information about J."""
     count = len(r.time_s)
     return replace(
         r, excitation=None if rng.random() < 0.5 else replace(r.excitation, segments=()),
@@ -127,7 +127,7 @@ def _(rng):
     return Trouble(creep=float(rng.choice((-1.0, 1.0))) * rng.uniform(0.2, 0.4))
 
 
-# -- what goes with it ---------------------------------------------------------------------------------------
+# -- data beside the record ---------------------------------------------------------------------------------------
 
 
 @family("offset")

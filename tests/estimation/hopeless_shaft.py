@@ -1,9 +1,9 @@
-"""A shaft with troubles, many records at once: for data that no inertia, or not without a word, can be had from.
+"""Shaft with faults, many records at once: data that give no J, or J with a warning only.
 
-Shares no code with what it tests. J 104 kg·m², B 8 N·m·s/rad, lags 0.40/0.15 s, torque mode with a slow PI on the
-mean speed; two mean speeds, five periods of 10 s each after one of settling. What goes wrong physically (friction that
-jumps, warms or wanders, other motion than was declared, a limit) happens in here; what goes wrong in the record is done
-to the Recording afterwards. The step of 10 ms makes J wrong by 0.04 %, far less than these records tell.
+It shares no code with the tested code. J 104 kg·m², B 8 N·m·s/rad, lags 0.40/0.15 s, torque mode with a slow PI on the
+mean speed; two mean speeds, five periods of 10 s each after one of settling. Physical faults (friction that
+jumps, warms or drifts, another motion than declared, a limit) are simulated here. Faults of the record are added
+to the Recording afterwards. The step of 10 ms causes an error of 0.04 % of J, far below the uncertainty here.
 """
 
 from dataclasses import dataclass, fields
@@ -25,13 +25,13 @@ LEAD_S = 3.0
 
 @dataclass(frozen=True)
 class Trouble:
-    """One record's; the defaults are a sound one."""
+    """Faults of one record; the defaults are a good record."""
 
     slow: float = 2.2             # mean speeds, rad/s
     fast: float = 5.0
     size: float = 1.0             # of the excitation
-    stretched: float = 0.0        # the motion's clock runs slower than the record's by this share
-    undeclared: float = 0.0       # rad/s, of a tone that nobody declared, at
+    stretched: float = 0.0        # relative error of the motion's clock, slower than the record's
+    undeclared: float = 0.0       # rad/s, of an undeclared tone, at
     undeclared_hz: float = 0.23
     stiction: float = 0.0         # N·m above Coulomb friction, gone by
     stribeck: float = 0.3         # rad/s
@@ -44,13 +44,13 @@ class Trouble:
     gust: float = 3.0             # N·m sd of the load
     ripple: float = 0.0           # rad/s in the reported speed, at
     ripple_hz: float = 100.1
-    only: int = -1                # the one line that is excited and declared; −1: all
+    only: int = -1                # the only excited and declared line; −1: all
     quiet: float = 0.0            # 1: no noise at all
     rate_hz: float = 100.0
 
 
 def sound_segments(trouble: Trouble) -> tuple[Segment, ...]:
-    """What is declared; the motion keeps to it but for what the trouble says."""
+    """Return the declared segments; the motion differs by the fault only."""
     length = PERIODS * PERIOD_S
     starts = (LEAD_S, LEAD_S + length + JOIN_S)
     return tuple(
@@ -60,12 +60,12 @@ def sound_segments(trouble: Trouble) -> tuple[Segment, ...]:
 
 
 def declared(only: int) -> tuple[tuple[float, ...], ...]:
-    """Lines, amplitudes and phases."""
+    """Return lines, amplitudes and phases of the declaration."""
     return tuple(part if only < 0 else part[only : only + 1] for part in (LINES, AMPLITUDES, PHASES))
 
 
 def simulate(troubles: list[Trouble], seed: int) -> list[Recording]:
-    """One recording per trouble."""
+    """Return one recording per fault."""
     p = {field.name: np.array([getattr(t, field.name) for t in troubles]) for field in fields(Trouble)}
     many = len(troubles)
     steps = round((LEAD_S + 2 * PERIODS * PERIOD_S + JOIN_S + 2.0) / DT)
@@ -105,7 +105,7 @@ def simulate(troubles: list[Trouble], seed: int) -> list[Recording]:
 
 
 def _reference(now: float, p: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Speed and acceleration that are asked for, (many,) each."""
+    """Return the requested speed and acceleration, (many,) each."""
     length = PERIODS * PERIOD_S
     second = LEAD_S + length + JOIN_S
     u = np.clip((now - LEAD_S - length) / JOIN_S, 0.0, 1.0)

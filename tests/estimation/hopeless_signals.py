@@ -1,4 +1,4 @@
-"""Signals that hardly move, were cut off at a limit, or are no numbers."""
+"""Signals that hardly change, are cut off at a limit, or are no numbers."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from tests.estimation.hopeless_shaft import Trouble
 SIGNALS, family, shaft = families()
 
 
-# -- no motion, or next to none ------------------------------------------------------------------------------
+# -- no motion, or very little --------------------------------------------------------------------------------
 
 
 @family("did not change")
@@ -101,7 +101,7 @@ def _(rng):
     return Trouble(torque_limit=rng.uniform(105.0, 150.0))
 
 
-# -- numbers that are none -----------------------------------------------------------------------------------
+# -- values that are no numbers -----------------------------------------------------------------------------------
 
 
 @family("not numbers")

@@ -1,4 +1,4 @@
-"""Time that goes wrong, and records with too little in them."""
+"""Faults of the time column, and records with too few data."""
 
 from dataclasses import replace
 
@@ -66,7 +66,7 @@ def _(rng):
     return Trouble(stretched=rng.choice((-1.0, 1.0)) * rng.uniform(0.005, 0.03))
 
 
-# -- how much there is ---------------------------------------------------------------------------------------
+# -- number of data -----------------------------------------------------------------------------------------
 
 
 @family("too few")

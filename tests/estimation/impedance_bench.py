@@ -1,7 +1,7 @@
-"""A drive in its speed loop, moved by a torque offset or by its reference, in closed form: what is linear is added up.
+"""Drive in its speed loop, excited by a torque offset or its reference, as a sum of closed-form linear responses.
 
-Shares no code with what it tests, nor with the simulated drive. The command's own lines, rounding included, go through
-the loop's transfer functions; so do load, ripple and the sensor's noise, drawn as spectra. What is reported is sampled
+It shares no code with the tested code or the simulated drive. The lines of the command, rounding included, pass
+through the loop's transfer functions, as do load, ripple and sensor noise, drawn as spectra. Reports are sampled
 and rounded.
 """
 
@@ -22,8 +22,8 @@ from tests.rigs import FieldRig
 HARMONICS = np.array([1, 2, 3, 5, 7, 10, 14, 20, 30])
 PHASES = np.array([0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651])
 PERIOD_S, MEAN, LEVELS, LEVEL_S = 20.0, 5.0, (2.9, 7.15), 10.0
-ZETA = 20.56                       # of 5 inch pipe at this motor: 296.5 N·m·s/rad times 104/1500
-SETTINGS = {                       # P and I at the motor: the reference case's, by 104/1500
+ZETA = 20.56                       # 5 inch pipe at this motor: 296.5 N·m·s/rad times 104/1500
+SETTINGS = {                       # P and I at the motor: those of the reference case times 104/1500
     "soft, a = 1": (20.6, 69.3), "soft, a = 0.25": (82.2, 69.3), "the paper's": (300.0, 300.0),
     "stiff": (1406.0, 1834.0),
 }
@@ -31,7 +31,7 @@ SETTINGS = {                       # P and I at the motor: the reference case's,
 
 @dataclass(frozen=True)
 class Machine(FieldRig):
-    """The rig with its speed loop; white noises are those of a step of 2 ms."""
+    """Rig with its speed loop; white noise is per step of 2 ms."""
 
     gain: float = 300.0
     integral: float = 300.0
@@ -43,31 +43,31 @@ class Machine(FieldRig):
     period: float = 0.004
     late: float = 0.0              # of the command
     torque_scale: float = 1.0      # reported torque over commanded torque
-    control: float = 0.0           # the loop's own sampling period, 0 for a continuous one
+    control: float = 0.0           # sampling period of the loop; 0: continuous
 
     def lag(self, time, s):
-        """First order; sampled, as y += (1 - exp(-h/time)) (x - y)."""
+        """Return a first-order lag; with sampling y += (1 - exp(-h/time)) (x - y)."""
         if self.control == 0.0:
             return 1.0 / (1.0 + time * s)
         keep = np.exp(-self.control / time)
         return (1.0 - keep) / (1.0 - keep * np.exp(-s * self.control))
 
     def torque_loop(self, s):
-        """Torque for one unit of what the loop demands; sampled, it holds from one step to the next."""
+        """Return torque per unit of demand; with sampling it is held from one step to the next."""
         step = s * self.control
         hold = 1.0 if self.control == 0.0 else (1.0 - np.exp(-step)) / step
         return self.lag(self.torque_lag, s) * hold
 
     @property
     def inner_lag(self):
-        """Of torque behind speed in the loop, for what is slow beside it: a lag that is sampled is shorter."""
+        """Return the lag of torque behind speed in the loop at low frequencies. A sampled lag is shorter."""
         if self.control == 0.0:
             return self.torque_lag + self.speed_filter
         kept = [np.exp(-self.control / time) for time in (self.torque_lag, self.speed_filter)]
         return self.control * (0.5 + sum(keep / (1.0 - keep) for keep in kept))
 
     def law(self, s):
-        """Sampled, it sums up the errors before the present one."""
+        """Return the control law; with sampling it integrates the errors before the present one."""
         summed = 1.0 / s if self.control == 0.0 else self.control / (np.exp(s * self.control) - 1.0)
         return (self.gain + self.integral * summed) * self.torque_loop(s)
 
@@ -80,7 +80,7 @@ class Machine(FieldRig):
         return np.abs((z - zeta) / (z + zeta))
 
     def driven(self, by, s):
-        """Speed for one unit of the command."""
+        """Return speed per unit of the command."""
         drive = self.torque_loop(s) if by == "offset" else self.law(s) / (1.0 + self.reference_filter * s)
         return drive * np.exp(-self.late * s) / self.impedance(s.imag / (2.0 * np.pi))
 
@@ -91,9 +91,9 @@ class Machine(FieldRig):
 
 @cache
 def command(machine, by, peak=None, draw=1):
-    """Sizes and phases of the lines: what the field rig's window (4 rad/s about its mean) and torque (210 N·m) leave.
+    """Return sizes and phases of the lines within the field rig's window (±4 rad/s) and torque (210 N·m).
 
-    By the offset with the best of some phases, as a run draws them: others with another ``draw``.
+    With the offset it uses the best of some random phases, as a run does. ``draw`` selects other phases.
     """
     hertz = HARMONICS / PERIOD_S
     s = 2j * np.pi * hertz
@@ -121,7 +121,7 @@ def command(machine, by, peak=None, draw=1):
 
 
 def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, scale_sd=0.0, declared=0.0, draw=1):
-    """A Recording: two levels, then the counted periods."""
+    """Return a Recording with two operating points and then the counted periods."""
     rng = np.random.default_rng(seed)
     h = machine.period
     sizes, phases = command(machine, by, peak, draw)
@@ -163,7 +163,7 @@ def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, s
 
 
 def _noise(machine, total, rng):
-    """Reported speed and torque of what disturbs the loop, (2, total)."""
+    """Return the reported speed and torque of the disturbances, (2, total)."""
     h = machine.period
     s = 2j * np.pi * np.fft.rfftfreq(total, h)
     s[0] = s[1]
@@ -182,7 +182,7 @@ def _noise(machine, total, rng):
 
 
 def found(recording):
-    """What is found of its impedance, without all that is found of its inertia."""
+    """Return the result for the impedance, without that for the inertia."""
     case = Case(recording, Options(), samples=usable_samples(recording))
     periodic = measured(case, recording.excitation)
     assert isinstance(periodic, PeriodicCase)

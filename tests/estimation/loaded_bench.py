@@ -1,8 +1,8 @@
-"""A drill string of the tests' own: waves in delay lines between a motor and a bit, many seeds at once.
+"""Independent drill string: waves in delay lines between motor and bit, many seeds at once.
 
-Down a = τ + ζω, up b = ζω − τ (τ the torque that goes down), each unchanged within a section. Where two sections meet
-mud drags with d: ω = (a + b)/(ζ₁ + ζ₂ + d), up goes 2ζ₁ω − a, down 2ζ₂ω − b. The motor: J dω/dt = T − T_c − (B + ζ) ω
-+ b; the bit: J_b dΩ/dt = a − ζΩ − T_bit − noise.
+Wave down a = τ + ζω, up b = ζω − τ (τ: torque down), constant within a section. Between two sections,
+mud drags with d: ω = (a + b)/(ζ₁ + ζ₂ + d), up 2ζ₁ω − a, down 2ζ₂ω − b. Motor: J dω/dt = T − T_c − (B + ζ) ω
++ b. Bit: J_b dΩ/dt = a − ζΩ − T_bit − noise.
 """
 
 from dataclasses import dataclass, replace
@@ -20,14 +20,14 @@ SECTION_STEPS = 4
 
 @dataclass(frozen=True)
 class Loaded:
-    """2300 m of pipe over a bit; ``bit_nm`` is what the bit takes at speed, ``bit_noise_nm`` what that scatters by."""
+    """2300 m of pipe above a bit. ``bit_nm``: torque of the bit in motion. ``bit_noise_nm``: its scatter."""
 
     motor: float = 1500.0
     viscous: float = 8.0
     resistance: float = 296.5
     sections: int = 9                 # of 0.08 s each
     drag: float = 11.5                # of all of the mud
-    collars: float = 1.0              # how many times the pipe's resistance the lowest section has
+    collars: float = 1.0              # ratio of the lowest section's impedance to the pipe's
     bottom: float = 374.0
     bit_nm: float = 2500.0
     bit_viscous: float = 20.0
@@ -35,29 +35,29 @@ class Loaded:
     bit_correlation_s: float = 0.3
     speed_lags_s: tuple[float, ...] = (0.40,)
     torque_lags_s: tuple[float, ...] = (0.15,)
-    hold: float = 750.0               # of the host's slow control of the mean speed, N·m·s/rad
+    hold: float = 750.0               # gain of the host's slow control of the mean speed, N·m·s/rad
     mean_rad_s: float = 20.0
-    own_lag_s: float = 0.01           # of the torque behind its setpoint
-    answered: bool = True             # is the torque's answer to its setpoint looked at?
+    own_lag_s: float = 0.01           # lag of the torque behind its setpoint
+    answered: bool = True             # is the response of the torque to its setpoint used?
     speed_noise_rad_s: float = 0.003
     torque_noise_nm: float = 5.0
 
     def pipe(self, wrong: float = 0.0) -> Pipe:
-        """As rig.yaml has it: ζ wrong by a share."""
+        """Return the pipe as in rig.yaml, with a relative error of ζ."""
         straight = self.sections - (self.collars != 1.0)
         delay_s, zeta = straight * SECTION_STEPS * STEP_S, self.resistance * (1.0 + wrong)
         return Pipe(zeta * delay_s, zeta / delay_s, 0.03, "rig.yaml")
 
 
 def turned(plant: Loaded, drive, noise):
-    """Speed of the motor and torque on it, (steps, runs); ``drive`` (steps,) and ``noise`` (steps, runs), N·m."""
+    """Return motor speed and torque, (steps, runs); ``drive`` (steps,) and ``noise`` (steps, runs), N·m."""
     steps, count = noise.shape
     mean, many = plant.mean_rad_s, plant.sections
     zeta = np.full(many, plant.resistance)
     zeta[-1] *= plant.collars
     drag = plant.drag / (many - 1)
     load = plant.bit_nm + plant.bit_viscous * mean
-    # what each section carries on the mean
+    # mean torque of each section
     carried = load + drag * mean * np.arange(many - 1, -1, -1.0)
     down = np.tile((carried + zeta * mean)[:, None, None], (1, SECTION_STEPS, count))
     up = np.tile((zeta * mean - carried)[:, None, None], (1, SECTION_STEPS, count))
@@ -88,13 +88,13 @@ def turned(plant: Loaded, drive, noise):
 
 
 def _over_a_step(tau_s):
-    """What is left of a deviation at a step's end, and on its mean."""
+    """Return the remaining share of a deviation at the end of a step, and its mean over the step."""
     share = np.exp(-STEP_S / tau_s)
     return share, (1.0 - share) * tau_s / STEP_S
 
 
 def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2, lag_prior=None):
-    """A recording for each of ``seeds``, its pipe wrong by 3 % (1 sd); ``torques`` (K,) complex, of the excitation."""
+    """Return one recording per seed with a pipe error of 3 % (1 sd); ``torques``: complex excitation, (K,)."""
     streams = [np.random.default_rng([7, seed]) for seed in seeds]
     time = STEP_S * np.arange(round((settle + periods) * period_s / STEP_S))
     drive = (np.exp(2j * np.pi * np.outer(time, lines_hz)) @ torques).real
@@ -123,7 +123,7 @@ def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2
 
 
 def late(signal, lag_s):
-    """A first-order lag, of what is between samples a straight line."""
+    """Apply a first-order lag to a signal that is linear between samples."""
     keep = np.exp(-STEP_S / lag_s)
     ramp = 1.0 - (1.0 - keep) * lag_s / STEP_S
     first = (1.0 - keep) - ramp

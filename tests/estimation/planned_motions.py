@@ -1,4 +1,4 @@
-"""The planned excitations as motions of the test bench."""
+"""Planned excitations as motions of the test bench."""
 
 import math
 
@@ -9,7 +9,7 @@ LIMITS = MotionLimits(0.5, 10.0, 400.0)
 
 
 def planned(wish: PlanRequest | None = None, guess: RigGuess | None = None) -> tuple[Motion, Plan]:
-    """A plan for the field-like rig, segment after segment with the transitions' time between them."""
+    """Return a plan for the field-like rig as a motion, with the time of transitions between segments."""
     plan = make_plan(LIMITS, guess or RigGuess(104.0, 8.0, 60.0), wish)
     now = 3.0
     segments, references = [], []

@@ -1,8 +1,8 @@
-"""Records without periodic excitation, simulated in plain numpy, many seeds at once; shares no code with what it tests.
+"""Records without periodic excitation in plain numpy, many seeds at once. It shares no code with the tested code.
 
-The shaft is stepped by the midpoint rule with Coulomb friction that sticks at rest; the drive has a speed PI behind a
-filter of 10 ms, a torque lag of 10 ms, a torque mode and an off state. What is reported is filtered, disturbed, sampled
-(at a rate, with jitter, errors of the stamps, late speed, holes) and rounded.
+The shaft is stepped by the midpoint rule, with Coulomb friction that sticks at standstill. The drive has a speed PI
+after a filter of 10 ms, a torque lag of 10 ms, a torque mode and an off state. Reports are filtered, disturbed, sampled
+(with jitter, errors of time stamps, late speed, gaps) and rounded.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SPEED, TORQUE, OFF = 0.0, 1.0, 2.0
 
 @dataclass(frozen=True)
 class Report:
-    """Poles (s), moving average (s) and delay (s) in a row."""
+    """Poles (s), moving average (s) and delay (s) of a report, in series."""
 
     poles: tuple[float, ...] = ()
     average: float = 0.0
@@ -29,7 +29,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Machine:
-    """SI at the motor shaft. ``pace`` stretches the motion's time; noises as sd, white ones per step."""
+    """Machine in SI units at the motor shaft. ``pace`` scales the time of the motion; noise as sd, white per step."""
 
     name: str
     inertia: float
@@ -37,7 +37,7 @@ class Machine:
     coulomb: float
     speed_report: Report
     torque_report: Report
-    top: float                      # rad/s, highest speed asked for
+    top: float                      # rad/s, highest requested speed
     limit: float                    # N·m
     pace: float = 1.0
     dt: float = 0.002
@@ -54,20 +54,20 @@ class Machine:
 
 @dataclass(frozen=True)
 class Reading:
-    """How the record was made."""
+    """Sampling of a record."""
 
     rate_hz: float = 100.0
     jitter_s: float = 0.003
     stamp_error_s: float = 0.0
-    speed_early_s: float = 0.0      # speed is read so much before torque
+    speed_early_s: float = 0.0      # time by which speed is read before torque
     lost: float = 0.0               # share of rows missing, single
     hole_s: float = 0.0             # one hole of this length in the middle
-    coarse: float = 1.0             # quanta are so much coarser
+    coarse: float = 1.0             # factor of a coarser resolution
 
 
 @dataclass
 class Script:
-    """What is asked for at every step, (steps,) or (steps, seeds): regime, target speed, torque."""
+    """Requests at every step, (steps,) or (steps, seeds): regime, target speed, torque."""
 
     regime: np.ndarray
     target: np.ndarray
@@ -84,7 +84,7 @@ def filtered(x: np.ndarray, report: Report, dt: float) -> np.ndarray:
 
 
 def turn(machine: Machine, script: Script, rngs: list[np.random.Generator]) -> tuple[np.ndarray, np.ndarray]:
-    """True speed as sensed and torque, (steps, seeds)."""
+    """Return true speed at the sensor and torque, (steps, seeds)."""
     from scipy.signal import lfilter
 
     m, dt, many = machine, machine.dt, len(rngs)
@@ -108,7 +108,7 @@ def _turn(
     m: Machine, regimes: list[int], target: list[float], torque: list[float], load: list[float], ripple: list[float],
     sensor: list[float],
 ) -> tuple[list[float], list[float]]:
-    """Of one seed, in plain numbers: for a few seeds an array a step costs ten times as much."""
+    """Simulate one seed with scalars: for a few seeds, arrays per step take ten times as long."""
     dt, limit, coulomb, viscous, quadratic = m.dt, m.limit, m.coulomb, m.viscous, m.quadratic
     omega = seen = target[0]
     motor = integral = viscous * omega + math.copysign(coulomb, omega) if omega else 0.0
@@ -182,7 +182,7 @@ def _grid(machine: Machine, duration: float) -> np.ndarray:
 
 
 def speed_steps(machine: Machine, rng: np.random.Generator) -> Script:
-    """Speed command in steps of a PI loop, every 4 to 9 s, within 15 to 100 % of the top speed."""
+    """Step the speed command of a PI loop every 4 to 9 s, within 15 to 100 % of the top speed."""
     t = _grid(machine, 100.0)
     edges = np.cumsum(rng.uniform(4.0, 9.0, 40))
     levels = machine.top * rng.uniform(0.15, 1.0, 41)
@@ -198,7 +198,7 @@ def up_down(machine: Machine, rng: np.random.Generator) -> Script:
 
 
 def ramp_coast(machine: Machine, rng: np.random.Generator) -> Script:
-    """From standstill: ramp up, hold, coast down to rest, wait; four times."""
+    """Ramp up from standstill, hold, coast down to standstill, and wait, four times."""
     t = _grid(machine, 120.0)
     cycle = 30.0
     phase = np.mod(t, cycle)
@@ -216,7 +216,7 @@ def _about(machine: Machine) -> tuple[float, float]:
 
 
 def torque_pulses(machine: Machine, rng: np.random.Generator) -> Script:
-    """Speed loop to a mean speed, then pairs of torque pulses up and down with friction's torque under them."""
+    """Speed loop to a mean speed, then pairs of torque pulses up and down about the friction torque."""
     t = _grid(machine, 100.0)
     middle, hold = _about(machine)
     extra = np.zeros(len(t))
@@ -234,7 +234,7 @@ def torque_pulses(machine: Machine, rng: np.random.Generator) -> Script:
 
 
 def torque_steps(machine: Machine, rng: np.random.Generator) -> Script:
-    """Random torque levels, each held 0.7 to 3 s; pulled back towards the mean speed by their own sum."""
+    """Random torque levels, each held for 0.7 to 3 s. Their sum is limited by a feedback to the mean speed."""
     t = _grid(machine, 100.0)
     middle, hold = _about(machine)
     extra = np.zeros(len(t))
@@ -268,7 +268,7 @@ HEAVY = Machine("heavy", 900.0, 74.3, 82.4, Report((0.25,)), Report((0.10,)), 10
 def simulate(
     machine: Machine, motion: str, seeds: list[int], reading: Reading | None = None, prior: LagPrior | None = None
 ) -> list[Recording]:
-    """One recording per seed. The motion "foreign" is speed steps read as a PLC would, ten times a second."""
+    """Return one recording per seed. The motion "foreign" is speed steps, read by a PLC ten times per second."""
     reading = reading or (FOREIGN if motion == "foreign" else Reading(250.0, 0.001) if machine.pace < 1 else Reading())
     make = MOTIONS["speed steps" if motion == "foreign" else motion]
     rngs = [np.random.default_rng([seed, 77]) for seed in seeds]

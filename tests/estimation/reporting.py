@@ -1,4 +1,4 @@
-"""What a bench reports of its shaft: signals of (steps, runs) at a step of ``dt``, and the recording of a run."""
+"""Reports of a bench: signals of (steps, runs) at a step of ``dt``, and the recording of a run."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from tdhil.recording.recording import Recording
 
 
 def lagged(x: np.ndarray, poles: tuple[float, ...], dt: float) -> np.ndarray:
-    """First-order lags in a row, exact for an input that is straight between steps, at rest before them."""
+    """Apply first-order lags in series, exact for an input that is linear between steps and constant before them."""
     from scipy.signal import lfilter
 
     for tau in poles:
@@ -24,6 +24,6 @@ def delayed(x: np.ndarray, delay_s: float, dt: float) -> np.ndarray:
 
 
 def recorded(time_s: np.ndarray, speed_rad_s: np.ndarray, torque_nm: np.ndarray, **facts: object) -> Recording:
-    """A recording of which every sample is fresh and none is limited, unless ``facts`` say so."""
+    """Return a recording with fresh, unlimited samples, unless ``facts`` state otherwise."""
     every = np.ones(len(time_s), dtype=bool)
     return Recording(time_s, speed_rad_s, torque_nm, **{"fresh": every, "limited": ~every, **facts})

@@ -1,6 +1,6 @@
-"""A bench of our own for identification: shaft, drive and host in plain numpy, many seeds at once.
+"""Independent bench for identification: shaft, drive and host in plain numpy, many seeds at once.
 
-It shares no code with what it tests: the plant is stepped at 2 ms (semi-implicit Euler on ω, exact for the filters),
+It shares no code with the tested code. The plant is stepped at 2 ms (semi-implicit Euler on ω, exact for the filters),
 the drive's speed loop and the host's slow PI are written out here, and the reported signals are filtered, disturbed and
 rounded as on the field-like rig of the notes (J 104 kg·m², B 8, Coulomb 60 N·m, lags 0.40/0.15 s).
 """
@@ -19,7 +19,7 @@ DT = 0.002
 
 @dataclass(frozen=True)
 class Rig(FieldRig):
-    stribeck: float = 0.0            # more friction at rest, a bell over speed of so many rad/s
+    stribeck: float = 0.0            # additional friction at standstill, a bell curve with this width in rad/s
     stribeck_width: float = 2.0
     torque_limit: float = 400.0
     speed_poles: tuple[float, ...] = (0.40,)
@@ -33,7 +33,7 @@ class Rig(FieldRig):
 
 @dataclass(frozen=True)
 class Motion:
-    """Segments of (reference(t) → speed, feed-forward torque), each for so long, joined by ramps of ``ramp_s``."""
+    """Segments of (reference(t) → speed, feed-forward torque), with their durations, joined by ramps of ``ramp_s``."""
 
     references: tuple[Callable[[float], tuple[float, float]], ...]
     segments: tuple[Segment, ...]    # start_s and end_s as they will be recorded
@@ -52,7 +52,7 @@ def averaged(x: np.ndarray, width_s: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Shaft:
-    """What truly happened, (steps, seeds): speed as sensed, torque at the shaft. Reports are made from it."""
+    """True motion, (steps, seeds): speed at the sensor, torque at the shaft. Reports are derived from it."""
 
     speed: np.ndarray
     torque: np.ndarray
@@ -60,7 +60,7 @@ class Shaft:
 
 
 def simulate(rig: Rig, motion: Motion, seeds: list[int], mode: str = "torque", **report: object) -> list[Recording]:
-    """One recording per seed."""
+    """Return one recording per seed."""
     return recordings(rig, motion, turn_shaft(rig, motion, seeds, mode), seeds, mode, **report)
 
 
@@ -135,7 +135,7 @@ def recordings(
     lag_prior: LagPrior | None = None,
     torque_scale_rel_sd: float = 0.0,
 ) -> list[Recording]:
-    """What the drive reports of it, one recording per seed; fewer seeds than the shaft has take its first columns."""
+    """Return the drive's reports, one recording per seed. Fewer seeds than columns use the first columns."""
     many = len(seeds)
     seen = averaged(lagged(shaft.speed[:, :many], rig.speed_poles, DT), rig.speed_average)
     speed = delayed(seen, rig.speed_delay, DT)
@@ -149,7 +149,7 @@ def recordings(
 
 
 def references(motion: Motion, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Target speed and feed-forward torque per step: the segments, half-cosine ramps in the gaps, rest held."""
+    """Return target speed and feed-forward torque per step: segments, half-cosine ramps between them, and holds."""
     time = np.arange(steps) * DT
     target, feed = np.full(steps, np.nan), np.full(steps, np.nan)
     for reference, segment in zip(motion.references, motion.segments, strict=True):
@@ -187,7 +187,7 @@ def _recorded(rig, motion, mode, k, rng, speed, torque, rate_hz, jitter_s, drop,
         seen_speed = np.round(seen_speed / rig.speed_quantum) * rig.speed_quantum
         seen_torque = np.round(seen_torque / rig.torque_quantum) * rig.torque_quantum
     fresh = rng.random(len(index)) >= drop if drop > 0.0 else np.ones(len(index), dtype=bool)
-    for i in np.flatnonzero(~fresh):     # a stale sample repeats what was there before
+    for i in np.flatnonzero(~fresh):     # a stale sample repeats the values before it
         if i > 0:
             seen_speed[i], seen_torque[i] = seen_speed[i - 1], seen_torque[i - 1]
     return recorded(

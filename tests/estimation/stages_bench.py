@@ -1,4 +1,4 @@
-"""Stages 2 to 5 of a run as a bench of our own, many seeds at once: ramps and holds before the excitation.
+"""Independent bench of stages 2 to 5, many seeds at once: ramps and holds before the excitation.
 
 Speeds, times and loops are like those of the protocol's default run, written out here: two steady speeds under a speed
 loop, the switch to torque and the drift to a lower speed, the host's slow PI to the first mean speed, a multisine about
@@ -21,20 +21,20 @@ OFFSETS, HOLDS, PERIOD = (3.6, 7.0), (2.9, 7.15), 10.0
 
 @dataclass(frozen=True)
 class Stages:
-    """What differs from the usual run."""
+    """Differences from the usual run."""
 
     rig: Rig = field(default_factory=Rig)
-    periods: int = 4                  # of each segment, the settling one included
+    periods: int = 4                  # periods of each segment, including the settling one
     static: float = 0.0               # Stribeck: breakaway torque above Coulomb's, N·m
     stribeck_speed: float = 3.0
     coast: bool = False               # torque off at the end, from the second mean speed
-    coast_torque: float = 0.0         # what the drive truly gives while it reports none
+    coast_torque: float = 0.0         # true torque while the drive reports none
     play: "Play | None" = None        # a load behind a coupling with play; None: one rigid shaft
 
 
 @dataclass(frozen=True)
 class Play:
-    """A load behind a coupling with play. Its inertia and its friction are parts of the rig's."""
+    """Load behind a coupling with play. Its inertia and friction are parts of the rig's."""
 
     angle: float                      # from flank to flank, rad; 0: a linear spring
     inertia: float                    # of the load, kg·m²
@@ -45,7 +45,7 @@ class Play:
 
 
 class _Coupling:
-    """Load and coupling, stepped beside the motor: a spring and a damper that can push, and not pull."""
+    """Load and coupling, stepped beside the motor: a spring and a damper that transmit pressure only."""
 
     def __init__(self, play: Play, rig: Rig, speed: np.ndarray) -> None:
         self.play, self.motor_inertia = play, rig.inertia - play.inertia
@@ -57,7 +57,7 @@ class _Coupling:
         self.twist = 0.5 * play.angle + held / self.stiffness
 
     def torque(self, motor_speed: np.ndarray) -> np.ndarray:
-        """Torque on the load; the load and the twist are moved on by one step."""
+        """Return the torque on the load; advance load and twist by one step."""
         half = 0.5 * self.play.angle
         closed = np.where(np.abs(self.twist) > half, self.twist - half * np.sign(self.twist), 0.0)
         found = self.stiffness * closed + self.damping * (motor_speed - self.speed)
@@ -68,25 +68,25 @@ class _Coupling:
         return found
 
     def turn(self, motor_speed: np.ndarray) -> None:
-        """Move the twist by one step, after both speeds."""
+        """Advance the twist by one step, after both speeds."""
         self.twist = self.twist + DT * (motor_speed - self.speed)
 
 
 def run_stages(stages: Stages, seeds: list[int], **report) -> list:
-    """One recording per seed."""
+    """Return one recording per seed."""
     motion, shaft, reported = turn(stages, seeds)
     return recordings(stages.rig, motion, replace(shaft, torque=reported), seeds, **report)
 
 
 @cache
 def ten_runs() -> tuple:
-    """The first ten of `usual_runs`, to the bit: a seed's run does not depend on its neighbours."""
+    """Return the first ten of `usual_runs`, bit for bit: the run of a seed does not depend on the others."""
     return tuple(run_stages(Stages(coast=True), list(range(10)), rate_hz=100.0))
 
 
 @cache
 def usual_runs() -> tuple:
-    """210 seeds of the usual run with a coast-down at its end: made once, looked at by several tests."""
+    """Return 210 seeds of the usual run with a coast-down at the end, simulated once for several tests."""
     stages = Stages(coast=True)
     return tuple(r for first in (0, 70, 140) for r in run_stages(stages, list(range(first, first + 70)), rate_hz=100.0))
 
@@ -161,7 +161,7 @@ def turn(stages: Stages, seeds: list[int]) -> tuple[Motion, Shaft, np.ndarray]:
 
 
 def reference(time, begin, length):
-    """Speed wanted, its rate, and who regulates: 0 the drive's speed loop, 1 nobody, 2 the host, 3 coasting."""
+    """Return set speed, its rate, and the control: 0 speed loop of the drive, 1 none, 2 the host, 3 coasting."""
     low, high = HOLDS
     target, rate = np.full(len(time), low), np.zeros(len(time))
     mode = np.where(time < 24.0, 0, np.where(time < 33.0, 1, 2))

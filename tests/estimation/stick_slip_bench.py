@@ -1,6 +1,6 @@
-"""Records of a shaft in stick-slip: Stribeck friction, and a PI speed loop too soft to hold the speed.
+"""Records of a shaft in stick-slip: Stribeck friction, and a PI speed loop that is too soft to hold the speed.
 
-Shares no code with what it tests. Many records are stepped side by side; what sticks is held exactly at standstill.
+It shares no code with the tested code. Many records are stepped together. A sticking shaft is exactly at standstill.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STEP = 0.001
 
 @dataclass(frozen=True)
 class StickSlip:
-    """SI at the motor shaft; ``pace_s`` is the unit of time: a small shaft swings faster."""
+    """Shaft in SI units at the motor; ``pace_s`` is the unit of time, since a small shaft oscillates faster."""
 
     inertia_kg_m2: float
     seed: int
@@ -38,13 +38,13 @@ class StickSlip:
 
 
 def draw(inertia_kg_m2: float, seed: int) -> StickSlip:
-    """The shaft of this inertia and seed."""
+    """Return the shaft with this inertia and seed."""
     rng = np.random.default_rng([seed, round(1e3 * inertia_kg_m2)])
     pace = float(np.clip(0.3 + 0.25 * (np.log10(inertia_kg_m2) + 2.0), 0.2, 1.5))
     stribeck = rng.uniform(0.5, 3.0) / pace
     coulomb = inertia_kg_m2 * stribeck / pace * rng.uniform(0.5, 3.0)
     breakaway = coulomb * rng.uniform(1.3, 2.5)
-    # too soft: less than friction falls with speed, and it takes some seconds to wind up to the breakaway torque
+    # too soft: less than the fall of friction with speed; it needs seconds to reach the breakaway torque
     gain = (breakaway - coulomb) / stribeck * rng.uniform(0.05, 0.5)
     integral = breakaway / (0.3 * stribeck * pace * rng.uniform(1.0, 5.0))
     return StickSlip(
@@ -58,7 +58,7 @@ def every_shaft() -> list[StickSlip]:
 
 
 def simulate(shafts: list[StickSlip]) -> list[Recording]:
-    """One record each. The setpoint of speed goes between a few low values, in steps or in ramps."""
+    """Return one record per shaft. The set speed changes between a few low values, in steps or ramps."""
     many, count = len(shafts), round(LENGTH / STEP)
     rngs = [np.random.default_rng([shaft.seed, 7, round(1e3 * shaft.inertia_kg_m2)]) for shaft in shafts]
 

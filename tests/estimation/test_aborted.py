@@ -1,4 +1,4 @@
-"""What comes after an abort is a stop, not an excitation: it must not matter, and the abort is named."""
+"""Data after an abort are a stop, not an excitation: they have no effect, and the result names the abort."""
 
 from dataclasses import replace
 
@@ -9,13 +9,13 @@ from tdhil.estimation import Verdict, identify
 from tdhil.recording.recording import MARGIN_S, Stage, before_abort
 from tests.estimation.analytic import closed_form
 
-pytestmark = pytest.mark.one_worker("default plan")      # its recording is one of 24 that are simulated at once
+pytestmark = pytest.mark.one_worker("default plan")      # 24 recordings are simulated at once
 
 DETAIL = "the drive left the state 'enabled' and shows 'off'"
 
 
 def aborted(recording, time_s, tail):
-    """The recording, aborted then: braking over two seconds, and ``tail`` seconds at rest."""
+    """Return the recording aborted at this time: braking for two seconds, then ``tail`` seconds at standstill."""
     cut = recording.time_s < time_s
     interval = float(np.median(np.diff(recording.time_s)))
     after = time_s + interval * np.arange(round((tail + 2.0) / interval))
@@ -34,7 +34,7 @@ def aborted(recording, time_s, tail):
 
 
 @pytest.mark.heavy
-def test_the_stop_is_not_taken_for_motion(one_recording):
+def test_the_stop_is_not_used_as_excitation(one_recording):
     end_s = float(one_recording.time_s[-1])
     found = identify(aborted(one_recording, end_s - 13.0, 20.0))
     assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
@@ -51,7 +51,7 @@ def test_whatever_follows_the_abort_the_result_is_the_same(one_recording, before
     if at_s <= 0.0:
         pytest.skip("the plan is shorter")
     short, long = (identify(aborted(one_recording, at_s, tail)) for tail in (1.0, 60.0))
-    killed = identify(before_abort(aborted(one_recording, at_s, 0.0)))      # as if its log ended there
+    killed = identify(before_abort(aborted(one_recording, at_s, 0.0)))      # the same as a log that ends there
     assert repr(short) == repr(long)
     assert short.inertia == killed.inertia
 
@@ -65,7 +65,7 @@ def test_before_the_excitation_there_is_no_number_and_the_abort_is_the_reason(on
     assert "still" not in found.reason
 
 
-def test_nothing_of_the_last_second_counts():
+def test_the_last_second_does_not_count():
     recording = closed_form()
     at_s = float(recording.time_s[-1]) - 20.0
     kept = before_abort(aborted(recording, at_s, 5.0))
@@ -76,6 +76,6 @@ def test_nothing_of_the_last_second_counts():
         assert periods == pytest.approx(round(periods), abs=1e-6)
 
 
-def test_a_run_that_went_to_its_end_is_left_as_it_is():
+def test_a_complete_run_is_used_unchanged():
     recording = closed_form()
     assert before_abort(recording) is recording

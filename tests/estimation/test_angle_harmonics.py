@@ -1,4 +1,4 @@
-"""Torque over the shaft's angle: found, measured, and out of J."""
+"""Torque over the shaft angle: it is found, measured, and removed from J."""
 
 import math
 from dataclasses import replace
@@ -17,7 +17,7 @@ TRUE, PHASE = 104.0, 0.7
 
 @cache
 def recorded(order: int, share: float) -> tuple:
-    """Two seeds of a run with one harmonic of this share of the rated torque."""
+    """Return two seeds of a run with one harmonic, as a share of the rated torque."""
     harmonics = ((order, share * RATED_NM, PHASE),) if order else ()
     return tuple(run_over_angle(OverAngle(rig=Rig(harmonics=harmonics)), [0, 1]))
 
@@ -46,8 +46,8 @@ def test_an_order_is_found_with_its_amplitude_and_phase(order, share):
 
 
 @pytest.mark.heavy
-def test_the_harmonic_is_out_of_the_inertia():
-    """With 10 % of rated torque at order 1 the scatter is that of the harmonic, unless it is taken out."""
+def test_the_harmonic_is_removed_from_the_inertia():
+    """With 10 % of rated torque at order 1, the harmonic determines the scatter unless it is subtracted."""
     for clean, bent in zip(recorded(0, 0.0), recorded(1, 0.1), strict=True):
         before, found = identify(replace(bent, position_rad=None)), identify(bent)
         without = identify(clean)
@@ -59,7 +59,7 @@ def test_the_harmonic_is_out_of_the_inertia():
 
 @pytest.mark.heavy
 def test_another_model_may_be_selected_without_the_harmonic():
-    """The model that is selected after the subtraction has one parameter more: its own count."""
+    """The model after the subtraction has one more parameter, and its own count of degrees of freedom."""
     rig = Rig(torque_lag=0.01, load_sd=4.081396661692406, sensor_sd=0.02, speed_quantum=0.001, torque_quantum=1.0,
               speed_poles=(0.02,), torque_poles=(0.01,), harmonics=((6, 0.1 * RATED_NM, -2.351135709653887),))
     recording = run_over_angle(OverAngle(rig=rig, every=1), range(100, 110))[4]
@@ -81,7 +81,7 @@ def test_nothing_changes_without_a_harmonic():
 def test_a_long_recording_is_used_whole_if_its_first_periods_show_an_order(monkeypatch):
     recording, without = recorded(6, 0.1)[0], recorded(0, 0.0)[0]
     whole = identify(recording).harmonics
-    monkeypatch.setattr(angle_harmonics, "LOOK_POINTS", 1)      # the three periods that are the least
+    monkeypatch.setattr(angle_harmonics, "LOOK_POINTS", 1)      # the minimum of three periods
     assert identify(recording).harmonics == whole
     assert identify(without).harmonics == ()
 

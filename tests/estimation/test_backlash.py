@@ -1,4 +1,4 @@
-"""Backlash of the coupling: found in the angle, measured, and in the interval of J."""
+"""Backlash of the coupling: found in the angle, measured, and included in the interval of J."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ TRUE, COUNT = 104.0, 2.0 * math.pi / COUNTS
 
 @cache
 def recorded(counts: float, inertia: float = 40.0, coulomb: float = 20.0) -> tuple:
-    """Two seeds of a run whose coupling has so many counts of play."""
+    """Return two seeds of a run whose coupling has this play in counts."""
     play = Play(counts * COUNT, inertia, coulomb, viscous=2.0)
     return tuple(run_over_angle(OverAngle(play=play), [0, 1]))
 
@@ -38,7 +38,7 @@ def test_backlash_is_found_with_its_angle(counts, inertia):
 
 
 @pytest.mark.heavy
-def test_backlash_widens_the_interval_and_stands_in_the_budget():
+def test_backlash_widens_the_interval_and_is_in_the_budget():
     recording = recorded(3.0)[0]
     found, before = identify(recording), identify(replace(recording, position_rad=None))
     assert before.backlash is None
@@ -54,7 +54,7 @@ def test_an_elastic_coupling_without_play_has_none():
 
 
 def test_a_play_that_the_load_never_crosses_is_not_found():
-    """The load's friction is above the largest torque that the motion takes from its inertia."""
+    """The friction of the load exceeds the largest inertia torque of the motion."""
     for recording in recorded(10.0, 20.0, 50.0):
         found = identify(recording)
         assert found.backlash == ()
@@ -72,8 +72,8 @@ def test_a_play_too_large_for_a_linear_shaft_is_the_reason():
 
 
 @pytest.mark.heavy
-def test_a_filter_that_the_play_has_bent_does_not_hide_it():
-    """The model finds lags of 0.46 and 0.30 s here; without a filter, the torque leaves less of the angle."""
+def test_lags_that_the_play_has_biased_do_not_hide_it():
+    """The model finds lags of 0.46 and 0.30 s here. Without a filter, the torque explains more of the angle."""
     rig = Rig(speed_poles=(0.02,), torque_poles=(0.01,), speed_quantum=0.0105, torque_quantum=1.0, load_sd=1.23)
     play = Play(60.0 * COUNT, 65.7, 10.8, 2.62, natural=162.5, ratio=0.15)
     for recording in run_over_angle(OverAngle(rig=rig, play=play, every=1), [270, 275]):
@@ -82,7 +82,7 @@ def test_a_filter_that_the_play_has_bent_does_not_hide_it():
         assert found.inertia is None or found.inertia.low <= TRUE <= found.inertia.high
 
 
-def test_too_few_angles_say_nothing():
+def test_too_few_angles_give_no_result():
     recording = recorded(3.0)[0]
     position = recording.position_rad.copy()
     position[np.arange(len(position)) % 500 != 0] = np.nan      # once in 2 s
@@ -90,7 +90,7 @@ def test_too_few_angles_say_nothing():
 
 
 def test_a_decaying_oscillation_is_no_backlash():
-    """A string swings for minutes after a change of its mean speed, and not with the period."""
+    """A string oscillates for minutes after a change of its mean speed, at another frequency than the period."""
     period_s, swing_hz, excited = 12.5, 0.176, tuple(range(1, 11))
     time = np.arange(0.0, 8 * period_s, 0.05)
     turned = 3.0 * time + 0.05 * np.exp(-0.02 * time) * np.cos(2.0 * math.pi * swing_hz * time)
@@ -107,7 +107,7 @@ def test_a_decaying_oscillation_is_no_backlash():
 
 
 def test_the_lines_of_uniform_and_of_jittered_periods():
-    """Both are those of the signal; the first have one set of equations, the second one for each period."""
+    """Both give the lines of the signal, with one set of equations for all periods, or one for each period."""
     segment, wanted = Segment(2.0, 12.0, 2.0, 1, 3.0, (0.5,), (1.0,), (0.0,)), np.array([0.3, 0.2 - 0.1j, 0.05j])
     rng = np.random.default_rng(3)
     for jitter_s in (0.0, 3e-3):

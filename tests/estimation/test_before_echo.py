@@ -1,4 +1,4 @@
-"""A string on bottom: its impedance before and after an echo, scatter that isn't any, and the inertia above it."""
+"""String on bottom: impedance before and after an echo, oscillation that is no scatter, and J above the string."""
 
 import re
 from dataclasses import replace
@@ -30,7 +30,7 @@ def record():
 
 @pytest.mark.parametrize(("end", "wave"), ((1.0, np.tanh), (-1.0, lambda x: 1.0 / np.tanh(x))), ids=("free", "held"))
 def test_one_echo_is_a_bar_that_ends(end, wave):
-    """d'Alembert's bar, free or held at its bottom: ζ tanh(s T) or ζ/tanh(s T), with the wave's way T."""
+    """The reference is d'Alembert's bar, free or held at the bottom: ζ tanh(s T) or ζ/tanh(s T), with travel time T."""
     pipe, s = PLANT.pipe(), 2j * np.pi * np.array(LINES_HZ)
     shaft = EchoShaft(pipe, 1.0)
     m = np.concatenate([[900.0, 7.0, 250.0], np.zeros(len(shaft.at_s))])
@@ -51,8 +51,8 @@ def test_slopes_are_differences():
         assert np.allclose(off[1][:, index], believed, atol=1e-6)
 
 
-def test_what_goes_down_comes_back_after_its_way():
-    """The bench: nothing but ζ until 2L/v after a push, whatever is below."""
+def test_a_wave_returns_after_the_round_trip_time():
+    """The bench shows only ζ until 2L/v after a torque pulse, independent of the bottom."""
     push = np.zeros(200)
     push[10] = 1000.0
     free = replace(PLANT, drag=0.0, hold=0.0, viscous=0.0)
@@ -84,9 +84,9 @@ def test_a_torque_scale_that_is_wrong_shows_in_the_impedance_of_the_pipe(record)
     assert re.search(r"the string has [\d.]+ times the characteristic impedance of the pipe", found.reason)
 
 
-def test_however_long_the_bottom_takes_to_answer():
-    """Lines without any scatter, of d'Alembert's bar with drag: what was looked at for 6 s alone made J wrong by
-    more than it said it might be."""
+def test_the_bottom_may_respond_at_any_time():
+    """Lines of d'Alembert's bar with drag, without scatter. Data of only 6 s caused an error of J
+    above the stated uncertainty."""
     pipe, hertz = PLANT.pipe(), 0.05 * np.arange(1, 31)
     s = 2j * np.pi * hertz
     below, down, along = 1000.0 * s + 20.0, s * pipe.inertia_kg_m2 + 11.5, s / pipe.stiffness_nm_rad
@@ -115,7 +115,7 @@ def test_refusals(record):
         problem_of(tuple(replace(line, hertz=0.2 * (k + 1)) for k, line in enumerate(lines)), record.pipe, LagPrior())
 
 
-def test_stick_slip_is_told_with_its_period(record):
+def test_stick_slip_is_reported_with_its_period(record):
     swing = 6.0 * np.sin(2.0 * np.pi * record.time_s / 5.3) + 1.5 * np.sin(4.0 * np.pi * record.time_s / 5.3)
     found = identify(replace(record, speed_rad_s=record.speed_rad_s + swing))
     assert found.verdict is Verdict.NOT_IDENTIFIABLE
@@ -124,7 +124,7 @@ def test_stick_slip_is_told_with_its_period(record):
 
 
 def _fit(rng, count, swing=0.0, periods=40):
-    """Lines of white scatter, and of a swing that goes on from period to period."""
+    """Return a fit of lines with white scatter and an oscillation that continues over the periods."""
     speed = np.ones((periods, count)) + 0.0j
     torque = np.full((periods, count), 5.0 + 3.0j)
     torque += rng.standard_normal((periods, count)) + 1j * rng.standard_normal((periods, count))
@@ -135,7 +135,7 @@ def _fit(rng, count, swing=0.0, periods=40):
 
 
 @pytest.mark.parametrize("swing", (0.0, 30.0))
-def test_a_swing_that_goes_on_is_no_scatter(swing):
+def test_a_continuing_oscillation_is_no_scatter(swing):
     fits = (_fit(np.random.default_rng(5), 30, swing),)
     plain = pooled_lines(fits, 0.0)
     found = np.mean([line.s_tt for line in unleaked(plain, fits)])
@@ -145,7 +145,7 @@ def test_a_swing_that_goes_on_is_no_scatter(swing):
 
 
 def answering(filtered, own_lag_s=0.01, length=None):
-    """A recording whose torque is commanded at random and reported through ``filtered``, and its answer."""
+    """Return the torque response from a random torque command and a report through ``filtered``."""
     time = STEP_S * np.arange(round(6 * PERIOD_S / STEP_S))
     commanded = (np.exp(2j * np.pi * np.outer(time, LINES_HZ)) @ TORQUES).real
     commanded += 100.0 * lfilter([0.1], [1.0, -0.9], np.random.default_rng(4).standard_normal(len(time)))
@@ -155,14 +155,14 @@ def answering(filtered, own_lag_s=0.01, length=None):
     return torque_answer(one, commanded[:length])
 
 
-def test_what_reports_the_torque_shows_in_its_answer_to_the_command():
+def test_the_filter_of_the_reported_torque_is_found_by_its_response():
     one = answering(lambda torque: np.roll(late(torque, 0.15), 3))
     assert one.lag_s == pytest.approx(0.16, abs=0.01) and one.shape == pytest.approx(0.06, abs=0.03)
     two = answering(lambda torque: late(late(torque, 0.1), 0.1))
     assert two.lag_s == pytest.approx(0.21, abs=0.012) and two.shape == pytest.approx(0.27, abs=0.03)
 
 
-def test_an_answer_that_is_no_filter_of_two_poles_tells_nothing():
+def test_a_response_that_is_no_filter_of_two_poles_is_not_used():
     average = np.ones(35) / 35.0
     assert answering(lambda torque: np.convolve(torque, average)[: len(torque)]) is None
     assert answering(lambda torque: np.random.default_rng(1).standard_normal(len(torque))) is None
@@ -170,8 +170,8 @@ def test_an_answer_that_is_no_filter_of_two_poles_tells_nothing():
 
 
 @pytest.mark.heavy
-def test_the_torques_answer_closes_what_its_filter_left_open(record):
-    """With nothing known of the filters, long ones before a lighter motor look alike."""
+def test_the_torque_response_narrows_the_interval(record):
+    """With unknown filters, long ones with a lighter motor give the same data."""
     found, blind = identify(record).inertia, identify(replace(record, torque_answer=None)).inertia
     assert found.low <= PLANT.motor <= found.high and blind.low <= PLANT.motor <= blind.high
     assert found.high - found.low < 0.7 * (blind.high - blind.low)
@@ -183,8 +183,8 @@ def test_the_torques_answer_closes_what_its_filter_left_open(record):
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("strongest_nm", (5.0, 4000.0), ids=("all", "all but one"))
-def test_lines_that_the_string_drowns_name_it(strongest_nm):
-    """A multisine's few lines, above a bit that scatters by far more than they move the shaft."""
+def test_lines_in_the_noise_of_the_string_name_it(strongest_nm):
+    """A multisine has few lines, and the noise of the bit is much larger than their effect."""
     lines = LINES_HZ[1:8:2]
     torques = np.array([strongest_nm, 5.0, 5.0, 5.0]) + 0.0j
     weak = records(replace(PLANT, bit_noise_nm=1000.0, answered=False), [1], lines, torques, PERIOD_S, 8)[0]
@@ -195,7 +195,7 @@ def test_lines_that_the_string_drowns_name_it(strongest_nm):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("torque_nm", "verdict"), ((200.0, Verdict.NOT_IDENTIFIABLE), (300.0, Verdict.VALID_WIDE)))
-def test_where_the_string_drowns_some_lines_and_the_others_tell_little_it_says_what_would_tell_more(torque_nm, verdict):
+def test_with_some_lines_in_the_noise_of_the_string_a_better_motion_is_advised(torque_nm, verdict):
     multiples = np.array([1, 2, 3, 4, 6, 8, 10, 13, 16, 20])
     torques = torque_nm * np.exp(2j * np.pi * np.random.default_rng(1).random(10))
     lines_hz = tuple(0.05 * multiples)

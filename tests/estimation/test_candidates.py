@@ -1,4 +1,4 @@
-"""The table of candidates: each row is tried in its place, and has a test that fails without it."""
+"""Table of candidates: each row is tried in its order, and has a test that fails without it."""
 
 import ast
 from dataclasses import dataclass, field, replace
@@ -32,7 +32,7 @@ def test_each_row_is_complete_and_has_its_own_name():
 
 
 @pytest.mark.parametrize("row", CANDIDATES, ids=lambda row: row.name)
-def test_the_test_of_each_row_is_there(row):
+def test_the_test_of_each_row_exists(row):
     path, _, name = row.test.partition("::")
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
@@ -52,7 +52,7 @@ def _trial(name, applies=True, ends=False):
     return ModelTrial(lambda now: applies, lambda now: replace(now, names=(*now.names, name), ended=ends))
 
 
-def test_rows_are_tried_in_the_order_of_the_table_and_the_last_ends_the_walk(monkeypatch):
+def test_rows_are_tried_in_the_order_of_the_table_up_to_the_last(monkeypatch):
     monkeypatch.setattr(candidates, "CANDIDATES", (_row("a"), _row("b"), _row("c"), _row("d")))
     trials = {"d": _trial("d"), "c": _trial("c", ends=True), "b": _trial("b", applies=False), "a": _trial("a")}
     assert walk(FitRoute.LOAD, trials, Tried()).names == ("a", "c")

@@ -1,4 +1,4 @@
-"""The natural cubic spline against that of scipy."""
+"""Natural cubic spline, compared with that of scipy."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Each recogniser alone: it sees its own fault, and nothing in a sound signal however that is rounded or sampled."""
+"""Each data check alone: it finds its own fault, and none in a good signal with any rounding or sampling."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from tests.estimation.analytic import closed_form
 
 
 def wave(seed, quantum, noise, flat=False):
-    """A minute of two or three tones at 100 Hz; ``flat``: with a crest as flat as x⁴."""
+    """Return a minute of two or three tones at 100 Hz. ``flat``: with a crest as flat as x⁴."""
     rng = np.random.default_rng(seed)
     t = np.arange(6000) / 100.0
     third = 1.0 / 9.0 if flat else rng.uniform(0.0, 0.5)
@@ -31,12 +31,12 @@ def wave(seed, quantum, noise, flat=False):
 def test_a_rounded_wave_is_not_clipped(quantum, noise, flat):
     for seed in range(10):
         assert flat_share(wave(seed, quantum, noise, flat), quantum) is None, seed
-        assert flat_share(wave(seed, quantum, noise, flat), 0.0) is None, seed       # nor if nobody knows the rounding
+        assert flat_share(wave(seed, quantum, noise, flat), 0.0) is None, seed       # nor with an unknown rounding
 
 
 @pytest.mark.parametrize("count", [20, 50, 80])
 def test_a_crest_that_every_period_samples_at_the_same_instants_is_not_clipped(count):
-    """Few samples a period: the greatest value comes once in each, and next to nothing lies just below it."""
+    """With few samples per period, the largest value occurs once in each, with few samples just below it."""
     t = np.arange(10 * count) / (count + 0.02)
     for seed in range(30):
         phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 3)
@@ -50,7 +50,7 @@ def test_a_crest_that_every_period_samples_at_the_same_instants_is_not_clipped(c
     (0.0, 0.0, 0.02), (0.0, 0.0, 0.3), (0.0, 0.02, 0.02), (0.0, 0.02, 0.3), (0.01, 0.02, 0.1), (0.01, 0.02, 0.3),
     (0.001, 0.0, 0.2),
 ])
-def test_a_flat_top_is_seen(quantum, noise, share):
+def test_a_flat_top_is_found(quantum, noise, share):
     for seed in range(10):
         x = wave(seed, quantum, noise)
         x = np.minimum(x, np.quantile(x, 1.0 - share))
@@ -65,14 +65,14 @@ def rounded(recording, speed_step, torque_step):
 
 @pytest.mark.parametrize(("at", "flat"), [(10, False), (14, True)])
 def test_a_top_left_steeply_is_flat_from_three_times_the_step_below(at, flat):
-    """Four samples one step below the top, then far down: 2.5 and 3.5 times as many at the top."""
+    """Four samples are one step below the top. The cases have 2.5 and 3.5 times as many at the top."""
     signal = np.tile([*[0.0] * at, *[-1.0] * 4, *(-50.0 - 7.0 * np.arange(20))], 10)
     assert (flat_share(signal, 1.0) is not None) is flat
 
 
 @pytest.mark.parametrize(("at", "flat"), [(36, False), (44, True)])
 def test_a_smooth_top_is_flat_from_twenty_times_the_step_below(at, flat):
-    """A ramp down and up between the tops has two samples one step below: 18 and 22 times as many at the top."""
+    """A ramp between the tops has two samples one step below. The cases have 18 and 22 times as many at the top."""
     ramp = -np.arange(1.0, 31.0)
     signal = np.tile([*[0.0] * at, *ramp, *ramp[-2::-1]], 10)
     assert (flat_share(signal, 1.0) is not None) is flat
@@ -120,7 +120,7 @@ def lines_of(recording):
 
 
 @pytest.mark.parametrize("share", [-0.02, -0.001, 0.0007, 0.003, 0.01])
-def test_the_true_period_is_told(share):
+def test_the_true_period_is_reported(share):
     recording = closed_form()
     slow = replace(recording, time_s=recording.time_s * (1.0 + share))
     assert wrong_period(*lines_of(slow)) == pytest.approx(share, abs=5e-4)
@@ -128,7 +128,7 @@ def test_the_true_period_is_told(share):
 
 
 def test_rounding_does_not_decide_whether_a_period_is_wrong():
-    """A record in closed form, and the same with its last bits otherwise, as another processor computes it."""
+    """The test uses a record in closed form, and the same with other last bits, as from another processor."""
     recording = closed_form()
     slow = replace(recording, time_s=recording.time_s * 1.0007)
     for seed in range(12):
@@ -138,7 +138,7 @@ def test_rounding_does_not_decide_whether_a_period_is_wrong():
 
 
 @pytest.mark.parametrize("hertz", [0.15, 0.25, 0.77, 2.1])
-def test_an_undeclared_tone_is_told_with_its_frequency(hertz):
+def test_an_undeclared_tone_is_reported_with_its_frequency(hertz):
     recording = closed_form(rate_hz=50.0)
     assert undeclared_warning(*lines_of(recording)) == ()
     tone = 0.4 * np.cos(2 * np.pi * hertz * recording.time_s)
@@ -149,8 +149,8 @@ def test_an_undeclared_tone_is_told_with_its_frequency(hertz):
 
 @pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("periods", [3, 5, 10, 60])
-def test_a_drift_is_seldom_seen_where_there_is_none(periods):
-    """The warning at 3.5 sd: once in two thousand runs, if the scatter is well known and if it isn't."""
+def test_a_drift_is_rarely_reported_without_one(periods):
+    """The warning at 3.5 sd comes once in two thousand runs, with a known and with an estimated scatter."""
     rng = np.random.default_rng(periods)
     time = [10.0 * np.arange(periods), 10.0 * np.arange(periods) + 1000.0]
     found = [warming_of(time, list(rng.standard_normal((2, periods)))) for _ in range(2000)]
@@ -158,7 +158,7 @@ def test_a_drift_is_seldom_seen_where_there_is_none(periods):
     assert 0.02 < np.mean([one.rate != 0.0 for one in found]) < 0.08
 
 
-def test_a_drift_is_told_with_its_size():
+def test_a_drift_is_reported_with_its_size():
     rng = np.random.default_rng(1)
     time = [10.0 * np.arange(6), 10.0 * np.arange(6) + 80.0]
     found = [warming_of(time, [0.2 * t + rng.standard_normal(6) for t in time]) for _ in range(200)]
@@ -170,7 +170,7 @@ def test_a_drift_is_told_with_its_size():
 
 @pytest.mark.parametrize(("missing_s", "whole"), [(0.02, 6), (0.2, 6), (0.3, 5)])
 def test_the_last_period_counts_where_the_record_ends_a_little_early(missing_s, whole):
-    """As much may be missing at the end as anywhere else: a tenth of the fastest cycle, here 0.25 s."""
+    """A tenth of the fastest cycle may be missing at the end as anywhere else, here 0.25 s."""
     recording = closed_form(offsets=(4.0,), rate_hz=100.0)
     until = recording.time_s < 70.0 - missing_s + 1e-9
     cut = replace(recording, **{
@@ -186,7 +186,7 @@ def test_the_last_period_counts_where_the_record_ends_a_little_early(missing_s, 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
 def test_a_calm_coarse_plateau_is_not_cut_off(noise):
-    """A speed that is ramped by three steps a sample and held in between: most steps are large, but not for noise."""
+    """The speed is ramped by three counts per sample and held in between. Most steps are large, but not from noise."""
     t = np.arange(1200) / 10.0
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -197,7 +197,7 @@ def test_a_calm_coarse_plateau_is_not_cut_off(noise):
 
 
 @pytest.mark.parametrize(("quantum", "noise"), [(0.01, 0.03), (0.001, 0.03)])
-def test_a_noisy_record_that_was_cut_off_is_seen(quantum, noise):
+def test_a_noisy_record_that_was_cut_off_is_found(quantum, noise):
     for seed in range(10):
         x = wave(seed, quantum, noise)
         x = np.minimum(x, np.round(np.quantile(x, 0.85) / quantum) * quantum)
@@ -213,17 +213,17 @@ SELECTED = {(0.0, "in between"), (0.15, "alike"), (0.5, "anyhow")}
 @pytest.mark.parametrize(("noise", "rate_hz", "shifted"), [
     pytest.param(
         noise, rate_hz, shifted,
-        # At the higher rate each noise is met once, and each way of shifting, in CI; all of them with --long.
+        # At the higher rate, CI tests each noise and each shift once; --long tests all combinations.
         marks=() if rate_hz == 10.0 and noise == 0.15
         else pytest.mark.heavy if (noise, shifted) in SELECTED else pytest.mark.long,
     )
     for noise in (0.0, 0.15, 0.5) for rate_hz in (10.0, 100.0) for shifted in ("alike", "anyhow", "in between")
 ])
-def test_what_rounding_leaves_in_the_mean_of_a_line(rate_hz, noise, shifted):
-    """Against 100 waves about random means, ten periods each; ``noise`` in steps; ``shifted``: instants in each.
+def test_the_error_of_rounding_in_the_mean_of_a_line(rate_hz, noise, shifted):
+    """Compare with 100 waves about random means, ten periods each. ``noise`` in counts; ``shifted``: sampling times.
 
-    In between: about half-way between those of the period before, so that they come again in every second one. Of P
-    periods' errors, with D in square and C from one to another, the mean has D/P + (1 - 1/P) C, and (D - C)/P of it is
+    In between: about half-way between those of the period before, so that they repeat in every second one. With P
+    periods of errors with variance D and covariance C, the mean has the variance D/P + (1 - 1/P) C. Of it, (D - C)/P is
     in the scatter.
     """
     rng = np.random.default_rng(7)
@@ -252,9 +252,9 @@ def test_what_rounding_leaves_in_the_mean_of_a_line(rate_hz, noise, shifted):
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("rate_hz", "offsets"), [(10.0, (4.0, 7.0)), (10.05, (4.03, 7.02))])
 def test_a_coarse_register_that_rounds_alike_in_every_period_is_no_contradiction(rate_hz, offsets):
-    """1 rpm at 10 Hz: the scatter between periods knows nothing of it, and spoke against the model at p = 1e-50.
+    """The scatter between periods does not include this error of 1 rpm at 10 Hz. The model was rejected, p = 1e-50.
 
-    Or alike in every second one, the samples of the one between lying half-way between its own.
+    In other cases every second period rounds alike, and the samples of the others are half-way between.
     """
     exact = closed_form(offsets=offsets, rate_hz=rate_hz)
     coarse = replace(rounded(exact, 0.1047, 1e-3), speed_resolution_rad_s=0.1047)

@@ -1,4 +1,4 @@
-"""The default plan on the field-like rig: bias, scatter and coverage over fixed seeds, and other truths."""
+"""Default plan on the field-like rig: bias, scatter and coverage over fixed seeds, and other true values."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def test_within_one_percent_and_covering(default_run, seeds):
     assert abs(np.mean(value) - 104.0) < 4.0 * 0.26 / np.sqrt(seeds)
     assert np.sqrt(np.mean((value - 104.0) ** 2)) < 0.34
     assert np.mean((low <= 104.0) & (high >= 104.0)) >= 0.9
-    assert np.mean(high - low) < 2.0 * 0.01 * 104.0          # and not by being wide
+    assert np.mean(high - low) < 2.0 * 0.01 * 104.0          # with a narrow interval
     assert {one.verdict for one in found} == {Verdict.VALID}
     assert plan.duration_s <= 320.0
     for name, truth in (("viscous_nm_s_rad", 8.0), ("coulomb_nm", 60.0), ("speed_lag_s", 0.40), ("torque_lag_s", 0.15),
@@ -83,7 +83,7 @@ def test_the_same_recording_gives_the_same_bits(one_recording):
 
 
 @pytest.mark.heavy
-def test_aborted_run_uses_the_whole_periods_that_there_are(one_recording):
+def test_aborted_run_uses_its_whole_periods(one_recording):
     first, second = one_recording.excitation.segments
     cut = second.start_s + 5.5 * second.period_s
     keep = one_recording.time_s < cut
@@ -110,7 +110,7 @@ def test_torque_scale_widens_only_the_total(one_recording):
     assert "torque scale exact" in found.conditional_on
 
 
-def test_papers_model_is_rejected_where_there_are_lags(one_recording):
+def test_papers_model_is_rejected_with_lags(one_recording):
     found = identify(one_recording, Options(model="paper"))
     assert found.verdict is Verdict.MODEL_REJECTED
     assert found.inertia is None

@@ -1,4 +1,4 @@
-"""Frequency response: intervals against exact responses, noise and distortion apart, exports that other tools read."""
+"""Frequency response: intervals compared with exact responses, noise and distortion, exports for other tools."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def linear():
 def test_the_intervals_contain_the_exact_response_of_python_control(linear):
     exact = control.frequency_response(plant(), 2.0 * np.pi * linear.hertz).frdata[0, 0]
     for line, g in zip(linear.lines, exact, strict=True):
-        # twice the half-width of 95 %: one of twelve leaves that in one case of a thousand
+        # twice the half-width of 95 %: one of twelve exceeds it in one case of a thousand
         inertia = (1.0 / g).imag / (2.0 * math.pi * line.hertz)
         for one, truth in ((line.magnitude, abs(g)), (line.phase_rad, np.angle(g)),
                            (line.apparent_inertia_kg_m2, inertia)):
@@ -66,22 +66,22 @@ def test_the_intervals_cover_as_often_as_stated():
     for seed in range(40):
         recording = closed_form(noise=3.0, seed=seed, periods=5, offsets=(4.0,))
         case = measured(Case(recording, Options(), samples=usable_samples(recording)), recording.excitation)
-        found = measure_response(case, None, (), "none")       # without the fit of a model, which costs most
+        found = measure_response(case, None, (), "none")       # without the slow fit of a model
         for line, g in zip(found.lines, exact, strict=True):
             lines += 1
             missed += not line.magnitude.low < abs(g) < line.magnitude.high
-    # 160 intervals of 95 %: more than 17 misses have a chance of 0.1 %
+    # 160 intervals of 95 %: more than 17 misses have a probability of 0.1 %
     assert lines == 160 and missed <= 17
 
 
 @pytest.mark.heavy
-def test_python_control_reads_the_arrays(linear):
+def test_python_control_accepts_the_arrays(linear):
     frd = control.FRD(*linear.to_frd())
     for line in linear.lines:
         omega = 2.0 * math.pi * line.hertz
         assert abs(complex(frd(1j * omega)) - line.magnitude.value * np.exp(1j * line.phase_rad.value)) <= (
             1e-12 * line.magnitude.value)
-    # its own algebra of responses turns ω/T into T/ω
+    # python-control inverts ω/T to T/ω
     assert np.allclose((1 / frd).frdata[0, 0], linear.impedance, rtol=1e-12, atol=0.0)
 
 
@@ -147,7 +147,7 @@ CUBIC_NM_S3 = 6.0          # N·m per (rad/s)³: a tenth of the viscous torque o
 
 
 def bent_by_its_speed(seed, realisations, amplitudes=(1.5, 0.8, 0.25, 0.25)):
-    """A recording at two mean speeds whose friction grows with the third power of the deviation of speed."""
+    """Return a recording at two mean speeds with a friction cubic in the deviation of speed."""
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (2, realisations, 4))
     phases = np.concatenate(phases if realisations > 1 else [phases[0], phases[0]])
     offsets = (4.0,) * realisations + (7.0,) * realisations
@@ -159,7 +159,7 @@ def bent_by_its_speed(seed, realisations, amplitudes=(1.5, 0.8, 0.25, 0.25)):
 
 
 def test_realisations_measure_the_distortion_of_the_lines_themselves():
-    """Their mean over all phases is 3/4 c a² + 3/2 c Σ b² for a line a beside others b; the intervals hold it."""
+    """Their mean over all phases is 3/4 c a² + 3/2 c Σ b² for a line a with others b. The intervals contain it."""
     a = np.array([1.5, 0.8, 0.25, 0.25])
     shift = CUBIC_NM_S3 * (0.75 * a**2 + 1.5 * (np.sum(a**2) - a**2))
     linear_z = 1.0 / control.frequency_response(plant(), 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4])).frdata[0, 0]
@@ -175,7 +175,7 @@ def test_realisations_measure_the_distortion_of_the_lines_themselves():
             if realisations == 4:
                 missed += sum(not line.magnitude.low < g < line.magnitude.high
                               for line, g in zip(found.lines, exact, strict=True))
-    assert missed <= 7                     # of 48 intervals of 95 %: more have a chance of 0.5 %
+    assert missed <= 7                     # of 48 intervals of 95 %: more misses have a probability of 0.5 %
     assert np.median(widths[4]) < 0.7 * np.median(widths[1])
 
 
@@ -199,13 +199,13 @@ def test_a_constant_friction_and_another_torque_scale_are_no_distortion(linear):
 
 def test_one_period_has_no_response_and_two_have():
     assert identify(closed_form(periods=2)).frequency_response is None
-    # two usable periods refuse J, for lack of degrees of freedom, and still show the lines
+    # two usable periods give no J, for lack of degrees of freedom, but still give the lines
     found = respond(closed_form(periods=3, offsets=(4.0,)))
     assert [line.periods for line in found.lines] == [2, 2, 2, 2]
     assert found.model == "none" and found.curve == ()
 
 
-def test_a_single_sine_has_a_response_though_it_tells_no_inertia():
+def test_a_single_sine_has_a_response_without_an_inertia():
     identified = identify(closed_form(lines=(0.1,), amplitudes=(1.5,), noise=3.0))
     found = identified.frequency_response
     assert identified.inertia is None and found is not None
@@ -226,8 +226,8 @@ def test_a_line_in_the_noise_has_an_open_interval():
     assert math.isfinite(found.lines[0].magnitude.high)
 
 
-def test_the_clearer_signal_is_divided_by():
-    """At an antiresonance the speed drowns; dividing by its square would be biased."""
+def test_the_signal_with_less_noise_is_the_divisor():
+    """The speed at an antiresonance is below the noise, and division by its square would be biased."""
     rng = np.random.default_rng(3)
     z, torque, seen = 200.0 * np.exp(0.3j), 10.0, []
     for _ in range(400):

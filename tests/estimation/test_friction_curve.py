@@ -1,4 +1,4 @@
-"""Friction over speed: every point covers, a bend is found where there is one and seldom where there is none."""
+"""Friction over speed: every point covers, and nonlinear friction is found if present and rarely if absent."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from tdhil.estimation.spectrum import period_lines
 from tests.estimation.reporting import recorded
 from tests.estimation.stages_bench import usual_runs
 
-pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
+pytestmark = pytest.mark.one_worker("friction")     # both use the same runs
 
 KNOWN = Inertia(104.0, 0.3, Delay(0.25, 0.02, True))
 STRIBECK = Params(friction="stribeck", static_nm=100.0, stribeck_speed_rad_s=3.0)
@@ -24,7 +24,7 @@ SPEEDS = (2.0, 3.0, 4.5, 6.0, 8.0)
 
 
 def held(plant, seed, speeds=SPEEDS, hold_s=14.0):
-    """The simulated drive's own speed loop at one speed after the other; what it reports at 100 Hz."""
+    """Return the 100 Hz reports of the simulated drive in speed mode at one speed after the other."""
     inverter = Inverter(RigParams(plant=plant), np.random.default_rng(seed))
     rows, now = [], 0.0
     count, step = inverter.steps(0.01)
@@ -50,7 +50,7 @@ def true_friction(plant, speed):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("plant", "bends"), [(Params(), False), (STRIBECK, True)])
-def test_points_cover_and_the_bend_is_told(plant, bends):
+def test_points_cover_and_nonlinear_friction_is_reported(plant, bends):
     covered = points = bent = 0
     for seed in range(12):
         curve = curve_of(held(plant, seed))
@@ -67,8 +67,8 @@ def test_points_cover_and_the_bend_is_told(plant, bends):
 
 
 @pytest.mark.heavy
-def test_the_spread_of_the_slope_is_of_the_size_that_the_bend_makes():
-    """Between 3 and 7 rad/s: chord against the two local slopes, from the formula of the plant."""
+def test_the_spread_of_the_slope_agrees_with_the_nonlinear_friction():
+    """Between 3 and 7 rad/s, the secant is compared with both local slopes, from the formula of the plant."""
     step = 1e-4
     ends = (3.0, 7.0)
     slopes = [(true_friction(STRIBECK, w + step) - true_friction(STRIBECK, w - step)) / (2.0 * step) for w in ends]
@@ -80,7 +80,7 @@ def test_the_spread_of_the_slope_is_of_the_size_that_the_bend_makes():
 
 @pytest.mark.long
 @pytest.mark.heavy
-def test_on_a_whole_run_every_point_covers_and_a_straight_line_is_left_straight():
+def test_on_a_whole_run_every_point_covers_and_linear_friction_stays_linear():
     covered = points = bent = 0
     for recording in usual_runs()[:100]:
         samples = usable_samples(recording)
@@ -92,7 +92,7 @@ def test_on_a_whole_run_every_point_covers_and_a_straight_line_is_left_straight(
         points += len(curve.points)
         covered += sum(p.torque_nm.low <= 60.0 + 8.0 * p.speed_rad_s <= p.torque_nm.high for p in curve.points)
         bent += curve.bent
-    assert covered / points >= 0.93           # points of one run share its density: not independent
+    assert covered / points >= 0.93           # points of one run share its noise density and are not independent
     assert bent <= binom.ppf(0.999, 100, 0.01)
 
 
@@ -102,7 +102,7 @@ def test_two_speeds_are_no_curve():
     assert curve.warnings == ()
 
 
-def test_without_scatter_to_go_by_there_are_no_intervals_and_so_no_points():
+def test_without_scatter_there_are_no_intervals_and_no_points():
     short = held(Params(), 1, (2.0, 4.0, 6.0), 7.0)
     assert curve_of(short, density=0.0, dof=0.0).points == ()
     assert curve_of(short, density=0.0).points == ()

@@ -1,8 +1,8 @@
-"""Two hundred malformed or hopeless records: never a number without a warning, never an exception or a Python warning.
+"""Two hundred malformed or unusable records: no number without a warning, no exception and no Python warning.
 
-Three of each family of `hopeless_families`, and twenty with two faults at once. Some eighty of them run without --long,
-and six of these with --heavy. Some also run as a CSV through the command line. A number that is let through must have
-an interval that covers (at 99.9 %, so that chance plays no part) and a warning.
+They are three of each family of `hopeless_families`, and twenty with two faults. About eighty run without --long,
+and six of these with --heavy. Some also run as a CSV through the command line. An accepted number must have
+a warning, and an interval that covers (at 99.9 %, to exclude chance).
 """
 
 import contextlib
@@ -33,7 +33,7 @@ def stream(one, number):
 
 @pytest.fixture(scope="module")
 def records():
-    """By family and number; what happens to the shaft is simulated once, all side by side."""
+    """Return the records by family and number. All faults of the shaft are simulated in one batch."""
     streams = {(one.name, number): stream(one, number) for one, number in CASES}
     troubles = [one.trouble(streams[one.name, number]) for one, number in CASES]
     kinds = list(dict.fromkeys(troubles))
@@ -46,7 +46,7 @@ def records():
         }
 
 
-def test_there_are_enough():
+def test_there_are_enough_records():
     assert len(CASES) >= LEAST
     assert len({one.name for one in FAMILIES}) == len(FAMILIES)
 
@@ -77,7 +77,7 @@ def test_never_a_number_without_a_warning(records, one, number):
 
 @pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
-def test_the_sound_record_has_a_number_and_no_warning():
+def test_the_good_record_has_a_number_and_no_warning():
     for record in simulate([Trouble()] * 4, 4):
         found = identify(record, Options(confidence=0.999))
         assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
@@ -87,7 +87,7 @@ def test_the_sound_record_has_a_number_and_no_warning():
 
 @pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
-def test_one_tone_with_nothing_known_of_the_lags_is_not_identifiable(records):
+def test_one_tone_with_unknown_lags_is_not_identifiable(records):
     for number in range(EACH):
         found = identify(records["one_tone", number])
         assert found.verdict is Verdict.NOT_IDENTIFIABLE
@@ -137,5 +137,5 @@ def test_as_a_trace_it_ends_in_one_clear_sentence(records, tmp_path, name):
         assert "\n" not in document["reason"]
     else:
         assert code == 0
-        # one warning is the assumed torque scale, which every trace has
+        # every trace has one warning, about the assumed torque scale
         assert len(document["warnings"]) >= 2

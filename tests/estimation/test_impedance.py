@@ -1,4 +1,4 @@
-"""The drive's own impedance from records in closed form: what is found, with which interval, and what is refused."""
+"""Impedance of the drive from records in closed form: results, intervals, and refusals."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from tdhil.recording.builder import RecordingBuilder
 from tests.estimation import impedance_bench
 from tests.estimation.impedance_bench import HARMONICS, PERIOD_S, SETTINGS, ZETA, Machine, command, found
 
-record = partial(impedance_bench.record, counted=12)       # half of what a run takes, and of the time to reckon
+record = partial(impedance_bench.record, counted=12)       # half of a run, for half of the computing time
 NAMED = pytest.mark.parametrize("name", SETTINGS)
 
 
@@ -28,7 +28,7 @@ def machine(name, **others):
 
 
 def holds(part, truth, times=1.0):
-    """Inside the interval, or as many times as wide a one."""
+    """Return whether the interval, widened by a factor, contains the true value."""
     return abs(part.value - truth) <= times * 0.5 * (part.high - part.low)
 
 
@@ -40,7 +40,7 @@ def test_gains_lags_and_reflection_are_found(name, by):
     drive = machine(name)
     seen = found(record(drive, by, seed=5))
     assert seen.verdict is Verdict.VALID, seen.reason
-    # one seed: twice the interval of 95 %; coverage over many is benchmarks/impedance_coverage.py's
+    # one seed: twice the interval of 95 %; see benchmarks/impedance_coverage.py for the coverage
     assert holds(seen.gain_nm_s_rad, drive.gain, 2.0)
     assert holds(seen.integral_nm_rad, drive.integral, 2.0)
     assert holds(seen.inner_lag_s, drive.inner_lag, 2.0)
@@ -53,13 +53,13 @@ def test_gains_lags_and_reflection_are_found(name, by):
     measured = {point.hertz: complex(*point.measured_nm_s_rad) for point in seen.points if point.measured_nm_s_rad}
     assert sorted(measured) == pytest.approx(HARMONICS / PERIOD_S)
     for line, one in measured.items():
-        # By itself a line scatters by a tenth and more where a soft loop hardly follows its reference.
+        # A single line scatters by a tenth or more if a soft loop hardly follows its reference.
         assert one == pytest.approx(drive.impedance(line), rel=0.1 if line < 0.7 or by == "offset" else 0.4)
 
 
 @pytest.mark.parametrize("integral", [0.0, 30000.0])
 def test_a_loop_in_closed_form_is_sampled_as_the_simulated_drive_is(integral):
-    # Else coverage of what a run finds would be told of a lag that the simulated drive hasn't got.
+    # Otherwise the coverage would be stated for a lag that the simulated drive does not have.
     params = DriveParams(speed_gain_nm_s_rad=300.0, speed_integral_gain_nm_rad=integral, torque_limit_nm=1e6)
     drive, step_s = Machine(integral=integral, control=params.control_period_s), params.control_period_s
     control, gain, torque = Controller(params), lag_gain(step_s, params.torque_lag_s), []
@@ -80,9 +80,9 @@ def test_a_loop_in_closed_form_is_sampled_as_the_simulated_drive_is(integral):
 
 @pytest.mark.heavy
 def test_a_sampled_integral_moves_the_gain_within_its_interval():
-    """P = 1600 and I = 800, every 2 ms, with a fiftieth of the usual noise: the loop acts as P − I h/2 = 1599.2."""
+    """With P = 1600, I = 800, 2 ms and a fiftieth of the usual noise, the effective gain is P − I h/2 = 1599.2."""
     few = {name: 0.02 * value for name, value in vars(Machine()).items() if name.endswith(("_sd", "noise", "quantum"))}
-    few["speed_quantum"] *= 0.05       # the bench's triangle of three counts would move P by 0.1
+    few["speed_quantum"] *= 0.05       # the coarse rounding of the bench would change P by 0.1
     drive = Machine(gain=1600.0, integral=800.0, control=0.002, **few)
     seen = found(record(drive, "offset", seed=0))
     assert seen.gain_nm_s_rad.value == pytest.approx(1599.2, abs=0.2)
@@ -104,8 +104,8 @@ def test_a_reference_filter_that_nobody_declared_is_refused(name):
 
 
 @pytest.mark.heavy
-def test_one_too_small_to_show_is_within_the_intervals():
-    """0.03 s that is not declared: with no room for it, these two records put P out of its interval."""
+def test_a_reference_filter_too_small_to_find_is_within_the_intervals():
+    """The filter of 0.03 s is not declared. Without an allowance, the interval of P misses in these two records."""
     drive = machine("the paper's", reference_filter=0.03)
     for seed in (1, 4):
         seen = found(record(drive, "reference", seed=seed, draw=seed + 1))
@@ -114,7 +114,7 @@ def test_one_too_small_to_show_is_within_the_intervals():
 
 
 @pytest.mark.heavy
-def test_one_that_is_declared_is_taken_off():
+def test_a_declared_reference_filter_is_removed():
     drive = machine("the paper's", reference_filter=0.1)
     seen = found(record(drive, "reference", seed=3, declared=0.1))
     assert seen.verdict is Verdict.VALID
@@ -123,8 +123,8 @@ def test_one_that_is_declared_is_taken_off():
 
 
 @pytest.mark.heavy
-def test_one_that_is_declared_wrongly_is_named_as_a_whole():
-    """Declared 0.2 s, true 0.3 s: the filter that is named is the true one, and it stands in place of the declared."""
+def test_a_wrongly_declared_reference_filter_is_reported_in_full():
+    """The filter is declared as 0.2 s and truly 0.3 s. The report names the true one instead of the declared one."""
     drive = machine("the paper's", reference_filter=0.3)
     seen = found(record(drive, "reference", seed=3, declared=0.2))
     assert seen.verdict is Verdict.MODEL_REJECTED
@@ -133,13 +133,13 @@ def test_one_that_is_declared_wrongly_is_named_as_a_whole():
 
 
 @pytest.mark.heavy
-def test_the_torque_offset_does_not_care_for_the_references_filter():
+def test_the_torque_offset_is_independent_of_the_reference_filter():
     seen = found(record(machine("soft, a = 0.25", reference_filter=0.1), "offset", seed=3))
     assert seen.verdict is Verdict.VALID
 
 
 @pytest.mark.heavy
-def test_a_drive_that_does_not_take_the_offset_is_told_apart_from_one_that_does():
+def test_a_drive_that_ignores_the_offset_is_distinguished_from_one_that_uses_it():
     recording = record(machine("the paper's"), "offset", seed=1, peak=0.6)
     refused = found(recording)
     assert refused.verdict is Verdict.NOT_IDENTIFIABLE
@@ -153,9 +153,9 @@ def test_too_few_periods_are_refused():
 
 
 @pytest.mark.heavy
-def test_a_report_that_is_no_first_order_lag_is_refused_and_not_fitted_away():
+def test_a_report_that_is_no_first_order_lag_is_refused():
     recording = record(machine("the paper's"), seed=1)
-    late = 60                      # samples, 0.24 s: of the speed alone
+    late = 60                      # samples, 0.24 s, of the speed only
     seen = found(replace(recording, speed_rad_s=np.concatenate([
         recording.speed_rad_s[:5000], np.roll(recording.speed_rad_s[5000:], late)
     ])))
@@ -165,7 +165,7 @@ def test_a_report_that_is_no_first_order_lag_is_refused_and_not_fitted_away():
 @pytest.mark.heavy
 @pytest.mark.parametrize("ratio", [0.97, 1.03])
 def test_another_scale_of_the_reported_torque_is_within_the_intervals(ratio):
-    """With the same scale taken for both, the lags come out as 18 to 22 ms at 3 %, and P beside its interval."""
+    """If both torques had the same scale, 3 % would give lags of 18 to 22 ms, and P outside of its interval."""
     drive = machine("the paper's", torque_scale=ratio)
     every = [found(record(drive, "offset", seed=seed, scale_sd=0.02)) for seed in range(4)]
     for name, truth in (("inner_lag_s", 0.03), ("gain_nm_s_rad", drive.gain), ("inertia_kg_m2", drive.inertia)):
@@ -176,7 +176,7 @@ def test_another_scale_of_the_reported_torque_is_within_the_intervals(ratio):
 
 @pytest.mark.heavy
 def test_a_soft_loop_has_a_wide_gain_if_the_torque_scales_may_differ():
-    """J − P Στ acts on the speed: 2.8 % of J is more than all of P Στ. |r| and I do not depend on it."""
+    """J − P Στ determines the speed, and 2.8 % of J exceeds P Στ. |r| and I do not depend on it."""
     drive = machine("soft, a = 1", torque_scale=1.03)
     seen = found(record(drive, "offset", seed=1, scale_sd=0.02))
     assert seen.verdict is Verdict.VALID
@@ -201,7 +201,7 @@ def test_by_the_reference_the_gains_of_the_drive_include_the_ratio_and_z_does_no
 
 @pytest.mark.heavy
 def test_a_calibration_of_the_reported_torque_does_not_move_the_gains_of_the_drive():
-    """Reports of 1/1.03 of the torque, calibrated: P and the lags stay those of the drive, as wide as before."""
+    """The report is 1/1.03 of the torque and calibrated. P and the lags keep their values and widths."""
     recording = record(machine("the paper's", torque_scale=1.0 / 1.03), "offset", seed=1, scale_sd=0.02)
     calibrated = StoredCalibration(1.03, 1.028, 1.032, 0.95, "2026-01-01", {}, {}, True).applied(recording)
     plain, seen = found(recording), found(calibrated)
@@ -220,7 +220,7 @@ def test_a_lag_at_its_bound_has_an_interval_from_0_to_an_upper_limit():
         assert seen.torque_lag_s.low == 0.0 and 0.002 < seen.torque_lag_s.high < 0.02
         misses += not seen.speed_filter_s.low <= 0.028 <= seen.speed_filter_s.high
         misses += not seen.inner_lag_s.low <= 0.030 <= seen.inner_lag_s.high
-    assert at_bound, "no seed has its lag at the bound"
+    assert at_bound, "the lag of no seed is at the bound"
     assert misses <= 1
 
 
@@ -229,7 +229,7 @@ def test_the_torque_scale_counts_in_the_reflection():
     drive = machine("soft, a = 0.25")
     seen = found(record(drive, seed=2, scale_sd=0.02))
     for one in seen.points:
-        # |r(κ Z)| of κ = 1 ± 0.02, and the interval's own width beside it
+        # |r(κ Z)| with κ = 1 ± 0.02, combined with the width of the interval
         z = complex(one.real_nm_s_rad.value, one.imaginary_nm_s_rad.value)
         moved = [abs((k * z - ZETA) / (k * z + ZETA)) for k in (0.98, 1.02)]
         half = np.hypot(1.96 * 0.5 * (max(moved) - min(moved)), 0.5 * (one.reflection.high - one.reflection.low))
@@ -246,7 +246,7 @@ def test_without_a_string_there_is_no_reflection():
 
 
 @pytest.mark.heavy
-def test_stated_lags_narrow_what_hangs_on_them():
+def test_stated_lags_narrow_the_intervals_that_depend_on_them():
     drive = machine("stiff")
     known = LagPrior(0.40, 0.002, 0.15, 0.002, "rig.yaml")
     free, stated = (found(record(drive, seed=4, prior=prior)) for prior in (None, known))
@@ -259,7 +259,7 @@ def width(part):
 
 
 @pytest.mark.heavy
-def test_the_whole_identification_has_it_beside_the_inertia_and_again_from_what_a_log_keeps():
+def test_the_identification_has_it_beside_the_inertia_and_a_log_reproduces_it():
     recording = record(machine("the paper's"), seed=6, scale_sd=0.02)
     whole = identify(recording)
     assert whole.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
@@ -276,7 +276,7 @@ def test_the_whole_identification_has_it_beside_the_inertia_and_again_from_what_
 
 
 @pytest.mark.heavy
-def test_the_command_is_what_was_sent_rounded_and_held():
+def test_the_command_is_the_rounded_and_held_setpoint():
     drive = machine("the paper's", torque_quantum=5.0)
     recording = record(drive, seed=1, counted=6)
     case = measured(Case(recording, Options(), samples=usable_samples(recording)), recording.excitation)

@@ -1,4 +1,4 @@
-"""The mean torque of stage 5 against the levels of stage 2: a torque scale that changed between them is found."""
+"""Mean torque of stage 5 compared with the operating points of stage 2: a change of the torque scale is found."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_such_a_run_has_no_inertia(recorded):
     assert found.verdict is Verdict.MODEL_REJECTED
 
 
-def test_above_a_string_of_unknown_inertia_the_result_states_what_stays_hidden(recorded):
+def test_above_a_string_of_unknown_inertia_the_result_states_which_error_stays_hidden(recorded):
     recording = replace(recorded[0], has_drill_string=True)
     case = Case(recording, Options(), samples=usable_samples(recording))
     shaft = Compliant(None, None, None, None, None, None)
@@ -74,7 +74,7 @@ def test_above_a_string_of_unknown_inertia_the_result_states_what_stays_hidden(r
     assert rigid.warnings == () and rigid.second_opinions[0].least_scale_change is None
 
 
-def test_one_level_or_none_says_nothing(recorded):
+def test_fewer_than_two_levels_give_no_result(recorded):
     recording = recorded[0]
     for levels in ((), recording.levels[:1], (recording.levels[0], recording.levels[0])):
         other = replace(recording, levels=levels)

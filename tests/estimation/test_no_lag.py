@@ -1,4 +1,4 @@
-"""Where descents could stand still: without lag, where a short one is felt by its square alone; at bounds; ridges."""
+"""Cases in which a descent could stall: no lag, where a short lag acts by its square only; bounds; ridges."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ HERTZ = (0.2, 0.4, 0.6, 0.8)
 
 
 class Averaged:
-    """A rigid shaft whose speed is shown as a moving average besides, its delay of half the window left out."""
+    """Rigid shaft whose reported speed is also a moving average, without its delay of half the window."""
 
     def impedance(self, hz):
         return (104.0 * 2j * np.pi * hz + 8.0) / np.sinc(hz * AVERAGE_S)
@@ -34,7 +34,7 @@ def truth_of(speed_lag, torque_lag):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_descent_that_begins_without_a_lag_finds_it(seed):
-    """scipy, begun at the truth, is the oracle; a descent from the best fit without torque's lag gets as low."""
+    """The oracle is scipy, started at the true values. A descent from the best fit without torque lag is as low."""
     truth = truth_of(0.215, 0.136)
     lines, constraint = synthetic(Averaged(), seed, 0.3, HERTZ, lags=(0.215, 0.136))
     problem = Likelihood(lines, Model(), constraint, ())
@@ -44,11 +44,11 @@ def test_a_descent_that_begins_without_a_lag_finds_it(seed):
                          bounds=(limits.low, limits.high), x_scale=limits.scale, xtol=1e-12)
     without = minimise(problem, limits, truth, {AT(signal_filters.TORQUE_LAG): 0.0})
     found = minimise(problem, limits, without.theta, {})
-    assert found.objective <= 2.0 * best.cost + 0.1      # an interval ends where it has risen by four
+    assert found.objective <= 2.0 * best.cost + 0.1      # an interval ends at a rise of four
 
 
 class Rigid:
-    """104 kg·m² and 8 N·m·s/rad."""
+    """Shaft with 104 kg·m² and 8 N·m·s/rad."""
 
     def impedance(self, hz):
         return 104.0 * 2j * np.pi * hz + 8.0
@@ -56,8 +56,8 @@ class Rigid:
 
 @pytest.mark.parametrize("seed", range(4, 8))
 @pytest.mark.parametrize("share", [0.985, 1.015])
-def test_a_descent_along_bounds_gets_to_the_bottom(seed, share):
-    """J held off its best, as on the way to an edge; scipy, begun where the descent ended, is the oracle."""
+def test_a_descent_along_bounds_finds_the_minimum(seed, share):
+    """J is fixed away from its best value, as in a profile. The oracle is scipy, started at the end of the descent."""
     lines, constraint = synthetic(Rigid(), seed, 0.3, (0.1, 0.2, 0.3, 0.5, 0.7, 1.0), lags=(0.4, 0.15))
     problem = Likelihood(lines, Model(), constraint, ())
     limits = box(problem, rough_inertia_of(problem))
@@ -86,7 +86,7 @@ def test_a_descent_along_bounds_gets_to_the_bottom(seed, share):
 
 
 class ThreePoles:
-    """A rigid shaft whose speed and torque are both shown through three poles."""
+    """Rigid shaft whose reported speed and torque both pass through three poles."""
 
     def impedance(self, hz):
         s = 2j * np.pi * hz
@@ -98,8 +98,8 @@ class ThreePoles:
 @pytest.mark.parametrize("seed", [
     0, pytest.param(1, marks=pytest.mark.heavy), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6)),
 ])
-def test_beyond_a_ridge_no_answer_lies_lower_at_an_edge(seed):
-    """One pole, or two and an average: a descent that begins with the one doesn't get to the other."""
+def test_no_fit_beyond_a_ridge_is_lower_at_an_edge(seed):
+    """A descent from a filter with one pole does not reach a filter with two poles and an average."""
     lines, constraint = synthetic(ThreePoles(), seed, 0.8, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), lags=(0.0, 0.0))
     inertia, _, fitted = fit_inertia(lines, constraint, (), {}, 0.95)
     rise = quantile_of(fitted, INERTIA, 0.95) ** 2

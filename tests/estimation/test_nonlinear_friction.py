@@ -1,4 +1,4 @@
-"""Friction that is no straight line over speed: its lines by hand, and an inertia that covers all the same."""
+"""Friction nonlinear in speed: its spectral lines by hand, and an interval of J that still covers."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def test_the_two_filters_have_the_ratio_that_the_lines_show(phi):
 
 
 def test_a_parabola_s_lines_by_hand():
-    """ω = m + A cos(Ωt + φ): ω² = m² + A²/2 + 2 m A cos(Ωt + φ) + …, each signal behind its own first-order lag."""
+    """For ω = m + A cos(Ωt + φ), ω² = m² + A²/2 + 2 m A cos(Ωt + φ) + …. Each signal has its own first-order lag."""
     mean, true, s = 5.0, 1.3 * np.exp(0.7j), 2j * np.pi * 0.2
     reported = true / (1.0 + 0.4 * s)
     lines, level = SegmentWave((0.2,), np.array([reported]), mean, 10.0).through(Parabola(), FIRST_ORDER)
@@ -51,13 +51,13 @@ def test_a_parabola_s_lines_by_hand():
     assert lines[0] == pytest.approx(2.0 * mean * true * np.exp(-0.02 * s) / (1.0 + 0.15 * s), rel=1e-12)
 
 
-def test_backwards_every_bend_is_the_mirror_image():
+def test_reverse_rotation_mirrors_each_nonlinear_friction():
     speed = np.array([0.3, 2.0, 7.0])
     for bend in bends(0.3, 7.0):
         assert np.allclose(bend.over(-speed), -bend.over(speed))
 
 
-def test_a_small_swing_sees_the_slope_of_a_bell():
+def test_a_small_amplitude_gives_the_slope_of_a_bell_curve():
     mean, bend = 2.0, Bell(1.5)
     slope = (bend.over(np.array([mean + 1e-4])) - bend.over(np.array([mean - 1e-4]))) / 2e-4
     lines, level = SegmentWave((0.1, 0.3), np.array([0.01, 0.02j]), mean, 10.0).through(bend, np.zeros(6))
@@ -78,7 +78,7 @@ def loaded(seed=3):
     return problem, np.concatenate([[104.0, 8.0, 2.0], FIRST_ORDER + 0.01])
 
 
-def test_slopes_by_the_bend_are_finite_differences():
+def test_derivatives_by_the_friction_parameters_are_finite_differences():
     problem, theta = loaded()
     _, slopes = problem.linearised(theta)
     for index in range(len(theta)):
@@ -90,7 +90,7 @@ def test_slopes_by_the_bend_are_finite_differences():
         assert slopes[:, index] == pytest.approx(difference, abs=1e-5 * np.abs(difference).max() + 1e-9)
 
 
-def test_lines_are_shown_without_the_bend():
+def test_lines_are_shown_without_the_nonlinear_friction():
     problem, theta = loaded()
     shown = np.concatenate([line.torque for line in problem.unloaded(theta)])
     error = shown - problem.model.impedance(theta, problem.s)[problem.owner] * problem.speed
@@ -99,7 +99,7 @@ def test_lines_are_shown_without_the_bend():
 
 
 def bent(recording, friction, speed_lag=0.40, torque_lag=0.15):
-    """The closed form's record with friction(ω) besides, by its Fourier series through the torque's filter."""
+    """Return the closed-form record plus friction(ω), by its Fourier series through the filter of the torque."""
     torque = recording.torque_nm.copy()
     s_of = 2j * np.pi
     for segment in recording.excitation.segments:
@@ -136,10 +136,8 @@ def test_without_noise_the_inertia_is_the_true_one(friction):
 
 
 @pytest.mark.heavy
-def test_a_bend_that_straight_friction_hardly_hides_is_seen():
-    """Windage behind a lag: its curve had leaked into the lines, p = 0.006, and was left there. By itself: whoever
-    asks for a rigid shaft has not had it looked whether the load swings.
-    """
+def test_a_weak_nonlinear_friction_is_found():
+    """Windage behind a lag biases the lines with p = 0.006, which used to be ignored. The model is automatic."""
     said = identify(bent(closed_form(noise=1.0, seed=6), lambda w: 0.021 * w**2))
     assert said.model == MODEL, said.reason
     assert "cast doubt on linear friction (p = 0.006)" in said.reason
@@ -149,7 +147,7 @@ def test_a_bend_that_straight_friction_hardly_hides_is_seen():
 
 @pytest.mark.heavy
 def test_a_bend_is_seen_behind_short_lags():
-    """Reports of 5 and 3 ms: descents that leave a lag in common on the way had ended there, and at p = 1e-158."""
+    """With lags of 5 and 3 ms, descents used to end at a common lag of both reports, with p = 1e-158."""
     recording = bent(closed_form(speed_lag=0.005, torque_lag=0.003, noise=0.05),
                      lambda w: 25.0 * np.exp(-((w / 1.7) ** 2)), 0.005, 0.003)
     said = identify(recording, Options(model="rigid"))
@@ -158,8 +156,8 @@ def test_a_bend_is_seen_behind_short_lags():
     assert said.inertia.low <= 104.0 <= said.inertia.high
 
 
-def test_lags_that_all_but_cancel_are_taken_out_of_the_wave():
-    """A straight fit with a second on both reports: by its lags the shaft would turn back and forth."""
+def test_lags_that_nearly_cancel_are_removed_from_the_motion():
+    """A linear fit has a lag of 1 s in both reports. With these lags the shaft would reverse."""
     wave = SegmentWave((0.1, 0.4), np.array([1.0 + 0.5j, 1.5j]), 4.0, 10.0)
     motion = ShaftMotion((wave,), None, (), None)
     straight = np.array([104.0, 8.0, 1.01, 0.0, 1.0, 0.0, 0.0, 0.01])
@@ -174,14 +172,14 @@ def test_straight_friction_is_not_bent():
 
 
 @pytest.mark.heavy
-def test_too_near_to_rest_nothing_is_made_of_it():
+def test_too_near_to_standstill_it_is_not_used():
     near = bent(closed_form(offsets=(2.15, 7.0), noise=0.05), lambda w: 25.0 * np.exp(-((w / 1.0) ** 2)))
     said = identify(near)
     assert said.verdict is Verdict.MODEL_REJECTED
     assert said.inertia is None
 
 
-def test_the_paper_s_model_is_not_helped():
+def test_the_paper_s_model_has_no_nonlinear_friction():
     said = identify(bent(closed_form(noise=0.05), lambda w: 0.7 * w**2), Options(model="paper"))
     assert said.verdict is Verdict.MODEL_REJECTED
 
@@ -190,7 +188,7 @@ def test_the_paper_s_model_is_not_helped():
 def test_on_a_rig_with_stribeck_friction_the_interval_covers(runs):
     records = run_stages(Stages(Rig(), periods=8, static=25.0, stribeck_speed=2.0), list(range(runs)), rate_hz=100.0)
     said = [identify(record) for record in records]
-    assert sum(one.model == MODEL for one in said) >= runs // 2    # the others pass for straight, with a wider B
+    assert sum(one.model == MODEL for one in said) >= runs // 2    # the others count as linear, with a wider B
     told = [one.inertia for one in said if one.inertia is not None]
     assert len(told) >= runs - 1
     assert sum(not one.low <= 104.0 <= one.high for one in told) <= runs // 6

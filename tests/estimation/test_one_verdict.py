@@ -1,4 +1,4 @@
-"""One builder of verdicts: every route brings a finding, and only `conclude` makes an Identification of it."""
+"""One builder of verdicts: every route gives a finding, and only `conclude` makes an Identification from it."""
 
 import ast
 from dataclasses import replace
@@ -68,7 +68,7 @@ def test_the_verdict_follows_from_tolerance_interval_and_p_value(finding, verdic
 
 
 @pytest.mark.parametrize(("scale_rel_sd", "advised"), [(0.0, False), (0.02, True)])
-def test_a_calibration_is_advised_where_the_torque_scale_is_most_of_the_interval(scale_rel_sd, advised):
+def test_a_calibration_is_advised_if_the_torque_scale_dominates_the_interval(scale_rel_sd, advised):
     one = case()
     said = conclude(replace(one, recording=replace(one.recording, torque_scale_rel_sd=scale_rel_sd)), FOUND)
     assert said.calibration_advised is advised is ("tdhil calibrate torque" in said.advice)
@@ -76,14 +76,14 @@ def test_a_calibration_is_advised_where_the_torque_scale_is_most_of_the_interval
     assert not wide.calibration_advised
 
 
-def test_what_the_reading_adds_widens_both_intervals():
+def test_uncertainty_of_the_sampling_widens_both_intervals():
     plain, wider = (conclude(case(), replace(FOUND, reading_kg_m2=half)).inertia for half in (0.0, 2.0))
     assert (plain.low, plain.high) == (99.0, 101.0)
     assert (wider.low, wider.high) == (97.0, 103.0)
     assert wider.low_total == plain.low_total - 2.0
 
 
-def test_an_abort_goes_before_all_that_the_data_say():
+def test_an_abort_takes_precedence_over_the_data():
     stood, fell = (conclude(case(aborted=STAGE), finding) for finding in (FOUND, REJECTED))
     assert stood.warnings[0].startswith("the run was aborted in stage acquire (the bus is gone). ")
     assert stood.reason == FOUND.explained

@@ -1,4 +1,4 @@
-"""The paper's method on single tones gives the slopes that its formula, and the field, show."""
+"""Method of the paper on single tones: it gives the slopes of its formula and of the field data."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tests.estimation.shaft_bench import Rig, simulate
 
 
 def slope(hertz, inertia=104.0, viscous=8.0, speed_lag=0.40, torque_lag=0.15):
-    """Where the regression tends to, by the notes' formula."""
+    """Return the limit of the regression slope, by the formula of the notes."""
     square = (2.0 * np.pi * hertz) ** 2
     below = 1.0 + square * torque_lag**2
     return inertia * (1.0 + square * speed_lag * torque_lag) / below + viscous * (speed_lag - torque_lag) / below
@@ -25,7 +25,7 @@ def test_single_tone_slopes(hertz, field):
     for recording in simulate(Rig(), motion, [1, 2]):
         found = identify(recording)
         assert found.paper.stepped.inertia_kg_m2 == pytest.approx(field, rel=0.02)
-        assert found.paper.raw_rate.inertia_kg_m2 < 0.8 * field      # collapses on rounded speed
+        assert found.paper.raw_rate.inertia_kg_m2 < 0.8 * field      # collapses with a rounded speed
         assert found.verdict is Verdict.NOT_IDENTIFIABLE
         assert found.inertia is None
         assert "2 equations" in found.reason

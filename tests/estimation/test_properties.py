@@ -1,4 +1,4 @@
-"""What must hold of any recording: scaling, shifting, turning round; and the closed form as oracle."""
+"""Properties of any recording: scaling, shift of time, reversal; with the closed form as the oracle."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from tests.estimation.analytic import closed_form
 
 pytestmark = pytest.mark.one_worker
 
-few = settings(max_examples=5, deadline=None, derandomize=True, phases=[Phase.generate])   # no minutes of shrinking
+few = settings(max_examples=5, deadline=None, derandomize=True, phases=[Phase.generate])   # no slow shrinking
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +50,9 @@ def test_the_clock_may_start_anywhere(plain, shift):
 TEN_LINES = {"lines": tuple(k / 10.0 for k in range(1, 11)), "amplitudes": (1.5, 0.8, *(0.1,) * 8)}
 
 
-@pytest.mark.long       # the intervals of a string that is none take a minute
-def test_of_a_string_that_ten_lines_do_not_show_a_rigid_shafts_inertia_may_be_the_motors_alone():
-    recording = closed_form(**TEN_LINES, unrecorded_s=20.0)      # without it the speed would jump between the segments
+@pytest.mark.long       # intervals of a string model on a rigid shaft take a minute
+def test_with_a_string_that_ten_lines_do_not_show_j_may_be_the_motors_only():
+    recording = closed_form(**TEN_LINES, unrecorded_s=20.0)      # no jump of speed between the segments
     plain, found = identify(recording), identify(replace(recording, has_drill_string=True))
     assert found.inertia == plain.inertia
     assert [entry_of(one, None) for one in found.warnings if one not in plain.warnings] == [
@@ -62,7 +62,7 @@ def test_of_a_string_that_ten_lines_do_not_show_a_rigid_shafts_inertia_may_be_th
 
 @pytest.mark.heavy
 def test_behind_a_declared_string_too_few_lines_to_show_it_give_no_inertia(plain):
-    """A rigid shaft explains these four lines; so would many strings, each with another inertia of the motor."""
+    """A rigid shaft explains these four lines, as do many strings with other motor inertias."""
     found = identify(replace(closed_form(), has_drill_string=True))
     assert plain.verdict is Verdict.VALID
     assert (found.verdict, found.inertia) == (Verdict.NOT_IDENTIFIABLE, None)
@@ -80,7 +80,7 @@ def test_rotation_may_be_either_way(plain):
 @pytest.mark.heavy
 @settings(few, max_examples=4)
 @given(
-    # J/B stays clear of what a lag may be (2 s): below, a lag and the shaft can change places, and J is refused
+    # J/B is above the largest lag (2 s). Below it, a lag and the shaft are interchangeable, and J is refused.
     inertia=st.floats(60.0, 500.0),
     viscous=st.floats(0.0, 15.0),
     coulomb=st.floats(0.0, 100.0),
@@ -93,7 +93,7 @@ def test_finds_the_truth_of_the_closed_form(inertia, viscous, coulomb, speed_lag
     found = identify(replace(recording, torque_limit_nm=None))
     assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     width = found.inertia.high - found.inertia.low
-    # twice the interval's width is 8 sd: no seed of such a test may fall outside
+    # twice the width of the interval is 8 sd: no seed may be outside
     assert abs(found.inertia.value - inertia) <= max(2.0 * width, 1e-4 * inertia)
     assert found.viscous_nm_s_rad.value == pytest.approx(viscous, abs=0.05)
     assert found.coulomb_nm.value == pytest.approx(coulomb, abs=0.3)
@@ -101,14 +101,14 @@ def test_finds_the_truth_of_the_closed_form(inertia, viscous, coulomb, speed_lag
 
 @pytest.mark.heavy
 def test_a_shaft_that_a_lag_can_impersonate_is_refused_or_wide():
-    """J/B = 1 s: (J s + B) = B (1 + s), so the shaft could be a lag of 1 s, and a lag the shaft."""
+    """With J/B = 1 s, (J s + B) = B (1 + s): shaft and a lag of 1 s are interchangeable."""
     found = identify(closed_form(20.0, 20.0, 0.0, 0.0, 0.0, 0.0, noise=0.02))
     assert found.verdict is Verdict.NOT_IDENTIFIABLE
     assert found.inertia is None
 
 
 @pytest.mark.heavy
-def test_torque_offset_is_taken_off():
+def test_torque_offset_is_subtracted():
     recording = closed_form()
     found = identify(replace(recording, torque_nm=recording.torque_nm + 25.0, torque_offset_nm=25.0))
     assert found.coulomb_nm.value == pytest.approx(60.0, abs=0.5)
@@ -136,7 +136,7 @@ def test_jacobian_is_the_derivative(u):
 
 
 def test_impedance_against_a_simulated_filter():
-    """An independent oracle: scipy's frequency response of the same rational function."""
+    """The independent oracle is scipy's frequency response of the same rational function."""
     from scipy.signal import freqs
 
     from tdhil.estimation.frequency_domain.model import Model
@@ -149,8 +149,8 @@ def test_impedance_against_a_simulated_filter():
 
 
 @pytest.mark.parametrize("over", ("speed", "torque"))
-def test_an_average_is_one_of_the_family(over):
-    """A mean over w of a rotating phasor, summed up sample by sample: half of w is delay, the rest u."""
+def test_a_moving_average_belongs_to_the_filter_family(over):
+    """The reference is the mean of a rotating phasor over w, sample by sample. Half of w is delay, the rest is u."""
     from tdhil.estimation.frequency_domain.signal_filters import FilterRatio
 
     w, omega = 0.5, np.array([0.6, 2.0, 5.0])
@@ -187,7 +187,7 @@ def test_likelihood_jacobian_is_the_derivative(stated):
 
 
 @given(speed=st.floats(0.0, 2.0), torque=st.floats(0.0, 2.0), unseen=st.floats(1e-3, 0.2))
-def test_only_a_lag_that_both_share_costs_anything(speed, torque, unseen):
+def test_only_a_lag_common_to_both_reports_has_a_penalty(speed, torque, unseen):
     value, by_speed, by_torque = shared_lag(speed, torque, unseen)
     assert (value, by_torque, by_speed) == pytest.approx(shared_lag(torque, speed, unseen))
     assert 0.0 <= value**2 <= np.log1p(2.0 * (min(speed, torque) / unseen) ** 2) + 1e-12
@@ -200,9 +200,8 @@ def test_only_a_lag_that_both_share_costs_anything(speed, torque, unseen):
 @pytest.mark.parametrize(("speed_lag", "torque_lag", "told"), [
     (0.006, 0.005, (0.0, 0.0)), (0.6, 0.5, (0.6, 0.5)), (0.8, 0.01, (0.8, 0.03)),
 ])
-def test_no_lag_is_made_up_where_there_is_none_and_none_lost_where_it_is_long(speed_lag, torque_lag, told):
-    """The first had been read as 0.465 and 0.462 s, which all but cancel, and J with them 0.21 % off instead of 0.10 %.
-    """
+def test_no_false_lag_is_found_and_no_long_lag_is_lost(speed_lag, torque_lag, told):
+    """The first case used to give 0.465 and 0.462 s, which nearly cancel, with an error of J of 0.21 %."""
     found = identify(closed_form(speed_lag=speed_lag, torque_lag=torque_lag, noise=8.0, seed=1), Options(model="rigid"))
     assert (found.speed_lag_s.value, found.torque_lag_s.value) == pytest.approx(told, abs=0.04)
     assert found.inertia.value == pytest.approx(104.0, rel=0.003)
@@ -211,7 +210,7 @@ def test_no_lag_is_made_up_where_there_is_none_and_none_lost_where_it_is_long(sp
 
 @pytest.mark.parametrize("seed", range(12))
 def test_descent_against_scipy(seed):
-    """The same bounded minimum as scipy's solver, on a curved valley with a bound across it."""
+    """Both solvers find the same bounded minimum in a curved valley with a bound across it."""
     from scipy.optimize import least_squares
 
     from tdhil.estimation.frequency_domain.optimiser import Box, descend
@@ -234,8 +233,8 @@ def test_descent_against_scipy(seed):
     assert np.all((found.theta >= low) & (found.theta <= high))
 
 
-def test_an_edge_of_a_profile_is_one_for_two_poles_too():
-    """−2 ln L = x² with one pole, ρ = 0, and 1 + x²/4 with two: it rises by 4 at √12, not at 2."""
+def test_the_edge_of_a_profile_also_applies_to_two_poles():
+    """−2 ln L is x² with one pole (ρ = 0) and 1 + x²/4 with two. It rises by 4 at √12, not at 2."""
     from tdhil.estimation.frequency_domain import profile_edge
     from tdhil.estimation.frequency_domain.optimiser import Box, Fit
 

@@ -1,4 +1,4 @@
-"""Hopeless data: never a number, never an exception, always a reason and advice."""
+"""Unusable data: no number and no exception, but a reason and advice."""
 
 from dataclasses import replace
 
@@ -128,7 +128,7 @@ def test_never_a_number(spoil):
 
 
 @pytest.mark.heavy
-def test_friction_that_is_no_straight_line_is_rejected():
+def test_nonlinear_friction_is_rejected():
     recording = closed_form(noise=0.3)
     torque = recording.torque_nm + 4.0 * (recording.speed_rad_s - 5.0) ** 2
     found = identify(replace(recording, torque_nm=torque))

@@ -1,4 +1,4 @@
-"""A rough inertia from one change of speed, through reporting lags: within a fifth, and it knows its own error."""
+"""Rough J from one change of speed, with reporting lags: within a fifth, with its own uncertainty."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from tests.estimation.loaded_bench import STEP_S, Loaded, late, turned
 
 
 def ramp(inertia=104.0, viscous=8.0, coulomb=60.0, speed_lag=0.4, torque_lag=0.15, seed=0, down=False, hold=5.0):
-    """A speed ramp from 2 to 6 rad/s in 4 s between two holds; the torque is what the balance asks for."""
+    """Return a speed ramp from 2 to 6 rad/s in 4 s between two holds, with the torque of the balance."""
     dt = 0.004
     time = np.arange(0.0, 2.0 * hold + 4.0, dt)
     u = np.clip((time - hold) / 4.0, 0.0, 1.0)
@@ -33,7 +33,7 @@ def ramp(inertia=104.0, viscous=8.0, coulomb=60.0, speed_lag=0.4, torque_lag=0.1
 @pytest.mark.heavy
 @pytest.mark.parametrize("down", [False, True])
 @pytest.mark.parametrize("lags", [(0.4, 0.15), (0.0, 0.0), (0.5, 0.0), (0.15, 0.5)])
-def test_within_a_fifth_whatever_the_lags(lags, down):
+def test_within_a_fifth_for_any_lags(lags, down):
     errors, claimed = [], []
     for seed in range(20):
         signals = ramp(speed_lag=lags[0], torque_lag=lags[1], seed=seed, down=down)
@@ -51,7 +51,7 @@ def test_friction_from_two_levels():
     assert found.coulomb_nm == pytest.approx(60.0, abs=8.0)
 
 
-def test_nothing_to_go_by_gives_nothing():
+def test_without_data_there_is_no_result():
     time, speed, torque = ramp()
     assert rough_inertia(time, np.full_like(speed, 3.0), torque, Level(1.0, 5.0), Level(11.0, 14.0)) is None
     assert rough_inertia(time, speed, torque, Level(11.0, 14.0), Level(1.0, 5.0)) is None
@@ -61,7 +61,7 @@ def test_nothing_to_go_by_gives_nothing():
     assert rough_inertia(time, speed, nan, Level(1.0, 5.0), Level(11.0, 14.0)) is None
 
 
-def test_levels_about_which_the_shaft_swings_are_known_by_their_means():
+def test_oscillating_operating_points_are_known_by_their_means():
     time, speed, torque = ramp(hold=24.0)
     swing = 1.45 * np.sin(2.0 * np.pi * time / 6.0 + 0.3)
     levels = Level(0.0, 24.0), Level(28.0, 52.0)
@@ -71,8 +71,8 @@ def test_levels_about_which_the_shaft_swings_are_known_by_their_means():
 
 
 @pytest.mark.parametrize("bottom", [60.0, 374.0])
-def test_above_a_restless_string_the_time_before_the_echo_tells(bottom):
-    """Six ramps above a bit that scatters by 500 N·m: the motor's own inertia, whatever hangs below."""
+def test_above_an_oscillating_string_the_time_before_the_echo_gives_j(bottom):
+    """Six ramps above a bit with a scatter of 500 N·m give the motor inertia for any string."""
     plant, runs = Loaded(bit_noise_nm=500.0, bottom=bottom, hold=400.0, speed_lags_s=(0.02,)), 8
     echo_s = 2.0 * plant.pipe().delay_s
     time, starts = STEP_S * np.arange(2400), 6.0 + np.cumsum([0.0, 8.3, 6.2, 9.1, 7.7, 6.6])
@@ -96,13 +96,13 @@ def test_above_a_restless_string_the_time_before_the_echo_tells(bottom):
     ("viscous", "coulomb", "at_rad_s", "opposing"),
     [
         (8.0, 60.0, 5.0, (8.0, 60.0)),
-        (-100.0, 5800.0, 20.0, (0.0, 3800.0)),     # falls with speed: the torque there, whatever the speed
-        (30.0, -60.0, 4.0, (15.0, 0.0)),           # pushes at standstill
+        (-100.0, 5800.0, 20.0, (0.0, 3800.0)),     # falls with speed: the torque at this point for any speed
+        (30.0, -60.0, 4.0, (15.0, 0.0)),           # drives at standstill
         (-100.0, 100.0, 4.0, (0.0, 0.0)),
         (0.0, -60.0, 4.0, (0.0, 0.0)),
     ],
 )
-def test_friction_that_would_push_keeps_its_torque_where_it_was_seen(viscous, coulomb, at_rad_s, opposing):
+def test_friction_that_would_drive_keeps_its_measured_torque(viscous, coulomb, at_rad_s, opposing):
     found = RoughFriction(viscous, coulomb, 1.0).opposing(at_rad_s)
     assert (found.viscous_nm_s_rad, found.coulomb_nm) == pytest.approx(opposing)
     assert found.level_sd_nm == 1.0

@@ -1,4 +1,4 @@
-"""J by the run-up of stage 2: it has the scales from before a change that all later balances agree with."""
+"""J by the run-up of stage 2: it uses the scales before a change with which all later balances agree."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def around(value, half):
 
 
 def run_up(seed=1, static_nm=0.0, noise_rad_s=0.003):
-    """From 0.6 rad/s to 2.8 rad/s within 1.8 s, then steady: B 8, T_c 60, read 20 times a second."""
+    """Return a run-up from 0.6 to 2.8 rad/s within 1.8 s, then steady: B 8, T_c 60, 20 samples per second."""
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, 16.0, FINE_S)
     speed = np.interp(time, (3.0, 4.8, 5.2, 6.2), (0.6, 2.8, 3.0, 2.8))
@@ -58,27 +58,27 @@ def test_it_covers_the_inertia_also_with_friction_that_falls_with_speed(static_n
 
 @pytest.mark.parametrize("share", [0.5, 2.0])
 def test_a_scale_that_changes_after_it_leaves_no_inertia(share):
-    """As lie 5087: a torque constant that doubles after the run-up halves J, and every later balance agrees."""
+    """The torque constant doubles after the run-up in lie 5087. J is halved, and every later balance agrees."""
     found = cross_checked(result(share * TRUE), case_of(run_up()))
     assert found.inertia is None
     assert found.contradiction.entry is MessageCode.METHODS_CONTRADICT
     assert "run-up of stage 2" in found.contradiction.reason
 
 
-def test_a_sound_result_stands():
+def test_a_good_result_is_kept():
     for seed in range(20):
         for static_nm in (0.0, 20.0):
             assert cross_checked(result(TRUE), case_of(run_up(seed, static_nm))).inertia is not None
 
 
-def test_a_coarse_one_says_nothing():
-    """Noise of the speed makes its J too small: healthy seed 441 lost its result."""
+def test_a_coarse_run_up_is_not_used():
+    """Noise of the speed makes J of the run-up too small. The healthy seed 441 used to lose its result."""
     for seed in range(20):
         assert cross_checked(result(TRUE), case_of(run_up(seed, noise_rad_s=0.1))).inertia is not None
     assert run_up_opinion(case_of(run_up(noise_rad_s=0.1)), result(TRUE)) == ()
 
 
-def test_without_a_run_up_lags_or_a_rigid_shaft_it_says_nothing():
+def test_without_a_run_up_lags_or_a_rigid_shaft_there_is_no_comparison():
     recording = run_up()
     for other in (replace(recording, stages=()), replace(recording, has_drill_string=True)):
         assert run_up_opinion(case_of(other), result(TRUE)) == ()

@@ -1,4 +1,4 @@
-"""Second opinions: each covers by its own interval, says no by chance as seldom as it should, finds what is wrong."""
+"""Momentum cross-checks: each covers with its own interval, rarely disagrees by chance, and finds errors."""
 
 import itertools
 import math
@@ -24,7 +24,7 @@ from tests.estimation.planned_motions import planned
 from tests.estimation.shaft_bench import Rig, simulate
 from tests.estimation.stages_bench import Stages, run_stages, ten_runs, usual_runs
 
-pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
+pytestmark = pytest.mark.one_worker("friction")     # both use the same runs
 
 TRUE = 104.0
 
@@ -34,7 +34,7 @@ def around(value, half):
 
 
 def result(inertia=TRUE, half=0.45, delay=0.25, delay_sd=0.018):
-    """What the lines may have said; delay None: nothing of the lags."""
+    """Return a result of the lines. ``delay`` None: unknown lags."""
     lag = None if delay is None else around(delay, 1.96 * delay_sd)
     zero = None if delay is None else around(0.0, 0.0)
     return Finding(inertia=around(inertia, half), speed_lag_s=lag, torque_lag_s=zero, skew_s=zero)
@@ -54,7 +54,7 @@ def opinions_of(recording, found=None, levels=True):
 
 @pytest.fixture(scope="module")
 def usual():
-    """Per route (seeds, 4): value, low, high, agrees; the result's J and delay as uncertain as they say they are."""
+    """Return per route (seeds, 4): value, low, high, agrees. J and delay have their stated uncertainty."""
     rng = np.random.default_rng(5)
     rows = {}
     for recording in usual_runs():
@@ -67,21 +67,21 @@ def usual():
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("route", ["speed change", "coast-down"])
-def test_its_own_interval_covers(usual, route):
+def test_each_interval_covers(usual, route):
     found = usual[route]
     assert len(found) == len(usual_runs())
     covered = int(np.sum((found[:, 1] <= TRUE) & (found[:, 2] >= TRUE)))
     assert covered >= binom.ppf(0.005, len(found), 0.95)
     error = found[:, 0] - TRUE
     assert abs(error.mean()) <= 0.2 + 3.0 * error.std() / math.sqrt(len(error))
-    # neither too wide to say anything, nor far from the scatter that there is
+    # neither too wide nor far from the true scatter
     half = 0.5 * (found[:, 2] - found[:, 1])
     assert 1.6 < half.mean() / error.std() < 3.0
     assert half.mean() < 0.04 * TRUE
 
 
 def test_the_lags_are_as_uncertain_at_any_confidence():
-    """Half an interval of 50 % is not 1.96 standard uncertainties: the delay counted as a third as uncertain."""
+    """The half-width of a 50 % interval is not 1.96 standard uncertainties. The delay used to count as too certain."""
     recording = usual_runs()[0]
     samples = usable_samples(recording)
     levels = levels_of(recording, samples)
@@ -113,8 +113,8 @@ def test_without_knowing_the_lags_it_is_wider_and_still_covers(runs):
 
 
 @pytest.mark.parametrize("runs", [pytest.param(20, marks=pytest.mark.heavy), pytest.param(60, marks=pytest.mark.long)])
-def test_without_excited_segments_the_rows_tell_the_scatter(runs):
-    """As after a refusal, or in a foreign trace: no levels, nothing of the lags, no result."""
+def test_without_excited_segments_the_rows_give_the_scatter(runs):
+    """The recording has no operating points, lags or results, as after a refusal or in a foreign trace."""
     nothing = replace(result(delay=None), inertia=None)
     covered = 0
     for recording in usual_runs()[:runs]:
@@ -137,15 +137,15 @@ def test_a_result_that_is_wrong_is_contradicted():
 
 
 @pytest.mark.heavy
-def test_torque_that_nobody_reports_is_found_by_the_coast_down():
-    """10 N·m brake while the drive says that it gives none."""
+def test_unreported_torque_is_found_by_the_coast_down():
+    """The true torque brakes with 10 N·m while the drive reports none."""
     hidden = run_stages(Stages(coast=True, coast_torque=-10.0), list(range(8)))
     verdicts = [{o.route: o.agrees for o in opinions_of(recording)} for recording in hidden]
     assert sum(v["coast-down"] is False for v in verdicts) >= 6
     assert sum(v["speed change"] is True for v in verdicts) >= 6
 
 
-def test_a_compliant_shaft_is_compared_with_all_that_turns():
+def test_a_compliant_shaft_is_compared_with_its_total_inertia():
     recording = ten_runs()[1]
     motor_only = result(80.0)
     whole = Compliant(around(TRUE, 0.5), around(24.0, 1.0), None, None, None, None)
@@ -166,8 +166,8 @@ def test_plateaus_of_a_square_wave_are_torque_steps():
 
 
 @pytest.mark.parametrize(("speed_lags", "torque_lags"), [((0.4,), (0.15,)), ((0.2, 0.2), (0.15,)), ((), (0.1, 0.2))])
-def test_a_balance_from_calm_to_calm_knows_of_the_reports_their_delay_only(speed_lags, torque_lags):
-    """2 to 6 rad/s on a half cosine, without noise: the balance closes for any filters once B δ is put in."""
+def test_a_balance_between_steady_states_depends_on_the_delay_of_the_reports_only(speed_lags, torque_lags):
+    """The balance from 2 to 6 rad/s on a half cosine without noise closes for any filters if B δ is included."""
     dt = 0.002
     time = np.arange(0.0, 20.0, dt)
     u = np.clip((time - 6.0) / 4.0, 0.0, 1.0)
@@ -183,7 +183,7 @@ def test_a_balance_from_calm_to_calm_knows_of_the_reports_their_delay_only(speed
         return x
 
     def delay_of(lags):
-        """Of these discrete filters: Σ n keepⁿ / Σ keepⁿ steps."""
+        """Return the delay of these discrete filters: Σ n keepⁿ / Σ keepⁿ steps."""
         return sum(dt * keep(lag) / (1.0 - keep(lag)) for lag in lags)
 
     row = through(Samples(time, lagged(speed, speed_lags), lagged(torque, torque_lags)), 2.0, 18.0, 1.0)
@@ -216,7 +216,7 @@ def record(time, speed, torque):
                      np.ones(n, bool), np.zeros(n, bool))
 
 
-def test_nothing_to_go_by_is_no_opinion_and_nothing_raises():
+def test_without_data_there_is_no_cross_check_and_no_exception():
     time = np.arange(0.0, 40.0, 0.01)
     rng = np.random.default_rng(1)
     ramp = np.clip(time - 15.0, 0.0, 4.0)
@@ -235,8 +235,8 @@ def test_nothing_to_go_by_is_no_opinion_and_nothing_raises():
         assert all(math.isfinite(o.inertia_kg_m2.high) and o.inertia_kg_m2.value > 0.0 for o in opinions)
 
 
-def test_torque_read_in_step_with_a_speed_setpoint_is_an_unknown_of_its_own():
-    """As at 15 cycles a second: in the rows that a speed setpoint moved, J reads a share too large."""
+def test_torque_read_in_step_with_a_speed_setpoint_is_a_separate_unknown():
+    """J is too large by a share in rows with a changing speed setpoint, as at 15 cycles per second."""
     plainly, openly = [], []
     for recording in ten_runs():
         found = balances(recording, usable_samples(recording))

@@ -1,4 +1,4 @@
-"""What sampling in step with a stepped setpoint may do to J: against a brute-force simulation, and in the interval."""
+"""Error of J from sampling in step with a stepped setpoint: compared with a simulation, and in the interval."""
 
 import numpy as np
 import pytest
@@ -20,9 +20,9 @@ FINE = 64
 
 
 def read_shares(stepped, lag_s, longest_s=100.0):
-    """J_read/J − 1 at every moment of a cycle, of a uniform acceleration in steps: the answers to all steps so far.
+    """Return J_read/J − 1 at every time within a cycle, for a uniform acceleration in steps, from all step responses.
 
-    The answer to one of them is made in the time domain by a library, not by residues.
+    A library computes the step response in the time domain, not by residues.
     """
     top = np.array([stepped.zero_s, 1.0, 0.0])
     bottom = np.polymul([stepped.second_s2, stepped.first_s, 1.0], [lag_s, 1.0])
@@ -37,7 +37,7 @@ def read_shares(stepped, lag_s, longest_s=100.0):
     gain=st.floats(1.0, 8.0), damping=st.floats(0.7, 1.5), period_s=st.sampled_from([0.05, 0.1]),
     lag_s=st.sampled_from([0.05, 0.15]),
 )
-def test_the_worst_share_is_the_worst_moment_s(gain, damping, period_s, lag_s):
+def test_the_worst_share_is_that_at_the_worst_time(gain, damping, period_s, lag_s):
     integral = (0.5 * gain / damping) ** 2
     stepped = SteppedSetpoint(period_s, gain / integral, gain / integral, 1.0 / integral)
     seen = float(np.max(np.abs(read_shares(stepped, lag_s))))
@@ -45,7 +45,7 @@ def test_the_worst_share_is_the_worst_moment_s(gain, damping, period_s, lag_s):
 
 
 def test_a_slow_response_counts_to_its_end():
-    slow = SteppedSetpoint(0.25, 32.2, 58.2, 95.0)      # a pole at 0.017 rad/s: 9 % of its response is left after 40 s
+    slow = SteppedSetpoint(0.25, 32.2, 58.2, 95.0)      # a pole at 0.017 rad/s: 9 % of its response remains after 40 s
     assert worst_share(slow, 0.05) == pytest.approx(float(np.max(np.abs(read_shares(slow, 0.05, 600.0)))), rel=0.1)
 
 
@@ -62,29 +62,29 @@ def test_it_vanishes_with_a_short_cycle_and_with_lag():
     assert shares[0] > 0.01
     assert shares[-1] < NEGLIGIBLE
     assert worst_share(SteppedSetpoint(0.1, *loop), 0.0) > 0.1 > worst_share(SteppedSetpoint(0.1, *loop), 0.05)
-    assert np.isfinite(worst_share(SteppedSetpoint(0.1, 1.0, 1.0, 0.25), 0.5))      # poles that meet
+    assert np.isfinite(worst_share(SteppedSetpoint(0.1, 1.0, 1.0, 0.25), 0.5))      # a double pole
 
 
 def pi_loop(period_s, gain=3.0, integral=1.0):
-    """H of a PI loop without friction, gains over J."""
+    """Return H of a PI loop without friction, with gains divided by J."""
     return SteppedSetpoint(period_s, gain / integral, gain / integral, 1.0 / integral)
 
 
 def staircase_skew(period_s, lag_s, after_s):
-    """By how much a torque that is set once a cycle is read later than it acts, s: of a slow ramp of the setpoint."""
+    """Return the time by which a torque with one setpoint per cycle is read later than it acts, s, for a slow ramp."""
     fine = period_s / 256
     held = np.repeat(np.arange(4000) * period_s, 256)
     keep = np.exp(-fine / lag_s)
     told = lfilter([1.0 - keep], [1.0, -keep], held)
     time = np.arange(len(held)) * fine
     at = 256 * 3000 + round(after_s / fine)
-    acts = time[at] - 0.5 * period_s - lag_s       # a line through the staircase, behind the lag
+    acts = time[at] - 0.5 * period_s - lag_s       # a straight line through the steps, after the lag
     return acts - told[at]
 
 
 @pytest.mark.parametrize("after", [0.1, 0.3, 0.5, 0.8])
 @pytest.mark.parametrize("lag_s", [1e-5, 0.01, 0.03])
-def test_the_skew_of_torque_mode_tells_what_a_ramp_in_speed_mode_is_read_with(after, lag_s):
+def test_the_skew_of_torque_mode_gives_the_error_of_a_ramp_in_speed_mode(after, lag_s):
     period_s = 1.0 / 15.0
     stepped = pi_loop(period_s)
     skew = staircase_skew(period_s, lag_s, after * period_s)
@@ -94,20 +94,20 @@ def test_the_skew_of_torque_mode_tells_what_a_ramp_in_speed_mode_is_read_with(af
     assert found.sd < 0.35 * np.max(np.abs(shares))
 
 
-def test_without_a_skew_every_moment_is_alike_likely():
+def test_without_a_skew_every_time_is_equally_likely():
     stepped = pi_loop(0.1)
     found = reading_share([stepped], None)
     assert abs(found.value) < 0.1 * found.sd
     assert found.sd == pytest.approx(float(np.std(read_shares(stepped, 0.0))), rel=0.05)
 
 
-def test_a_share_that_does_not_matter_is_none():
+def test_a_negligible_share_is_none():
     moment = ReadMoment(0.0, 0.001, 0.15)
     assert reading_share([pi_loop(0.004)], moment) == EXACT_READING
     assert reading_share(usual_loops(0.004), None, 0.15) == EXACT_READING
 
 
-def test_a_loop_that_is_not_known_leaves_more_open():
+def test_an_unknown_loop_gives_a_wider_interval():
     moment = ReadMoment(-0.014, 0.001, 0.0)
     known = reading_share([pi_loop(1.0 / 15.0)], moment)
     usual = reading_share(usual_loops(1.0 / 15.0), moment)

@@ -1,4 +1,4 @@
-"""Small-sample uncertainty of a joint fit: the rule, held against a weighted mean with estimated weights."""
+"""Small-sample uncertainty of a joint fit: the rule, compared with a weighted mean with estimated weights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def shares_of(weights, dof):
 
 
 @pytest.mark.parametrize("dof", DOF)
-def test_the_rise_is_half_of_meier_s_for_a_weighted_mean(dof):
+def test_the_increase_is_half_of_meier_s_for_a_weighted_mean(dof):
     """Meier (Biometrics 9, 1953): (1/W)(1 + 4 Σ p (1 − p)/n), p = w/W. `Likelihood.information` has the other half."""
     weights = np.arange(1.0, len(dof) + 1.0)
     share = weights / weights.sum()
@@ -30,7 +30,7 @@ def test_the_rise_is_half_of_meier_s_for_a_weighted_mean(dof):
 
 @pytest.mark.parametrize("nu", [6.0, 10.0, 20.0])
 def test_the_stated_variance_is_that_of_a_mean_with_estimated_weights(nu):
-    """Mean of the stated variances over the variance of the estimates, for 20 lines of a complex signal.
+    """The ratio of the mean stated variance to the variance of the estimates is 1, for 20 lines of a complex signal.
 
     A weight is a reciprocal variance from χ² with 2ν degrees of freedom, times (ν − 1)/ν, as that of a line in the fit.
     """
@@ -44,6 +44,6 @@ def test_the_stated_variance_is_that_of_a_mean_with_estimated_weights(nu):
     assert np.mean(stated) / np.var(estimates) == pytest.approx(1.0, abs=0.05)
 
 
-def test_one_line_alone_has_its_own_degrees_of_freedom_and_no_rise():
+def test_one_line_alone_has_its_own_degrees_of_freedom_and_no_increase():
     shares = shares_of([2.0], [7.0])
     assert satterthwaite(shares) == pytest.approx(7.0) and rise_by_weights(shares) == pytest.approx(1.0)

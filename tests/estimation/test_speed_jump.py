@@ -1,4 +1,4 @@
-"""A reported speed that jumps above a string: a scale that changes during the run is found, a healthy run is not."""
+"""Jump of the reported speed above a string: a change of scale during the run is found, without false alarms."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.one_worker      # its fixture is expensive
 
 PLANT = Pipe()
 AT_S = 60.0
-LAG_S = 0.2               # of the drive's filter behind the sensor
+LAG_S = 0.2               # time constant of the drive's filter after the sensor
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def recorded():
 
 
 def rescaled(recording, factor, lag_s=LAG_S):
-    """The sensor's scale changes at `AT_S`; the drive's filter smooths the jump."""
+    """Change the scale of the sensor at `AT_S`; the filter of the drive smooths the jump."""
     keep = np.exp(-float(np.median(np.diff(recording.time_s))) / lag_s)
     step = np.where(recording.time_s >= AT_S, factor, 1.0)
     share = lfilter([1.0 - keep], [1.0, -keep], step, zi=[keep])[0]
@@ -66,11 +66,11 @@ def test_a_single_false_report_is_no_jump(recorded):
 def test_in_speed_mode_the_reported_torque_bounds_the_true_one(recorded, factor, command):
     in_speed_mode = replace(recorded, commanded_torque_nm=command and np.full(len(recorded.time_s), np.nan))
     assert jump_contradiction(in_speed_mode, 0.8 * PLANT.motor, PLANT.motor) is None
-    inertia = PLANT.motor / factor                           # what such a run identifies
+    inertia = PLANT.motor / factor                           # result of such a run
     assert jump_contradiction(rescaled(in_speed_mode, factor), 0.95 * inertia, inertia) is not None
 
 
-def test_nothing_is_said_without_a_command_and_a_torque_limit(recorded):
+def test_there_is_no_result_without_a_command_and_a_torque_limit(recorded):
     in_speed_mode = replace(rescaled(recorded, 2.0), commanded_torque_nm=None, torque_limit_nm=None)
     assert jump_contradiction(in_speed_mode, PLANT.motor, PLANT.motor) is None
     assert MOST < 1.0
@@ -82,6 +82,6 @@ def test_a_jump_after_stage_5_is_not_searched(recorded):
 
 
 @pytest.mark.heavy
-def test_a_rigid_shaft_is_not_asked(recorded):
+def test_a_rigid_shaft_is_not_checked(recorded):
     rigid = replace(rescaled(recorded, 2.0), has_drill_string=False)
     assert identify(rigid).entry is not MessageCode.SPEED_JUMPED

@@ -1,4 +1,4 @@
-"""Gains of the drive's speed loop from the ramp of stage 2: against a simulation, and what is not read."""
+"""Gains of the drive's speed loop from the ramp of stage 2: compared with a simulation; unsuitable drives."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ RAMP_S, END_S = (8.0, 16.0), 22.0
 
 
 def ramped(gain=300.0, integral=300.0, rate_hz=15.0, speed_lag_s=0.0, setpoint_lag_s=0.0, seed=1):
-    """J 104, B 8, T_c 60 under a PI loop whose setpoint is stepped once a cycle and read 30 ms later."""
+    """Return a record with J 104, B 8, T_c 60 and a PI loop; the setpoint steps once per cycle and acts 30 ms later."""
     rng = np.random.default_rng(seed)
     each = round(1.0 / (rate_hz * FINE_S))
     speed, told, total, smoothed = LOW, LOW, 60.0 + 8.0 * LOW, LOW
@@ -56,7 +56,7 @@ def test_a_drive_that_smooths_its_setpoint_is_not_read_as_a_plain_loop():
     assert speed_loop(recording, usable_samples(recording), 0.0) is None
 
 
-def test_without_a_ramp_of_stage_2_nothing_is_told():
+def test_without_a_ramp_of_stage_2_there_is_no_result():
     recording = ramped()
     samples = usable_samples(recording)
     for other in (replace(recording, ramps=()), replace(recording, levels=()), replace(recording, stages=())):

@@ -1,4 +1,4 @@
-"""Records of a shaft in stick-slip: none is answered with a wrong interval, most are named, sound ones never."""
+"""Records of a shaft in stick-slip: no wrong interval, most are recognised, and there are no false alarms."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def named(recording):
 
 
 def check(shafts):
-    """No wrong interval; how many were named."""
+    """Assert that no interval is wrong; return the number of recognised records."""
     count = 0
     for shaft, recording in zip(shafts, in_stick_slip(shafts), strict=True):
         found = identify(recording, Options())
@@ -43,7 +43,7 @@ def check(shafts):
 
 
 @pytest.mark.heavy
-def test_stick_slip_is_named_and_never_answered_wrong():
+def test_stick_slip_is_recognised_without_a_wrong_interval():
     shafts = every_shaft()[::18]
     assert check(shafts) >= 0.6 * len(shafts)
 
@@ -51,7 +51,7 @@ def test_stick_slip_is_named_and_never_answered_wrong():
 @pytest.mark.parametrize("every", [
     pytest.param(18, marks=pytest.mark.heavy), pytest.param(1, marks=pytest.mark.long),
 ])
-def test_none_of_108_records_in_stick_slip_is_answered_wrong(every):
+def test_none_of_108_records_in_stick_slip_has_a_wrong_interval(every):
     shafts = every_shaft()
     assert len(shafts) == 108
     some = shafts[1::every] if every > 1 else shafts
@@ -60,8 +60,8 @@ def test_none_of_108_records_in_stick_slip_is_answered_wrong(every):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("machine", [FIELD, SERVO, HEAVY], ids=lambda machine: machine.name)
-def test_sound_records_are_never_called_stick_slip(machine):
-    """Among them starts from standstill, coasting to standstill, and speeds that go through zero."""
+def test_good_records_are_never_reported_as_stick_slip(machine):
+    """The records contain starts from standstill, coasting to standstill, and zero crossings of the speed."""
     for motion in (*MOTIONS, "foreign"):
         for recording in simulate(machine, motion, [1, 2]):
             assert named(recording) is None, motion
@@ -78,13 +78,13 @@ def case():
     return Case(recording, Options(), samples=usable_samples(recording))
 
 
-def test_an_answer_that_could_not_be_tested_is_none():
+def test_a_result_without_a_residual_test_is_refused():
     with pytest.raises(Refused, match="too few frequencies to test the model"):
         finding_of(solved(None), case())
 
 
 @pytest.mark.parametrize(("p_value", "stands"), [(0.0034, False), (0.0099, False), (0.011, True)])
-def test_an_answer_whose_residual_test_fails_at_one_percent_is_none(p_value, stands):
+def test_a_result_whose_residual_test_fails_at_one_percent_is_refused(p_value, stands):
     one = case()
     found = conclude(one, finding_of(solved(ResidualTest(3.0, 5.0, p_value)), one))
     assert (found.inertia is not None) == stands
@@ -93,7 +93,7 @@ def test_an_answer_whose_residual_test_fails_at_one_percent_is_none(p_value, sta
 
 @pytest.mark.heavy
 def test_a_record_with_few_frequencies_in_a_row_is_tested_as_well():
-    """A machine that stops often has short windows; the test's larger groups of frequencies do not fit into them."""
+    """A machine that stops often has short windows. Larger groups of frequencies do not fit into them."""
     (recording,) = simulate(FIELD, "speed steps", [1])
     samples = thinned(usable_samples(recording))
     placed = place_windows(runs(samples, recording.speed_resolution_rad_s, 2.5))

@@ -1,4 +1,4 @@
-"""The drill string: its impedance against the waves, and a string that is told from two masses."""
+"""Drill string: its impedance compared with the waves, and its distinction from two masses."""
 
 import cmath
 from dataclasses import replace
@@ -24,7 +24,7 @@ few = settings(max_examples=20, deadline=None, derandomize=True, phases=[Phase.g
 
 
 def string_parameters(pipe):
-    """As the estimator has them."""
+    """Return the parameters of the string in the estimator's form."""
     share = pipe.inertia / pipe.load
     swing = np.sqrt(pipe.stiffness / (pipe.load * (1.0 - 2.0 / 3.0 * share)))
     below = pipe.drag + pipe.end_viscous
@@ -41,7 +41,7 @@ def test_impedance_is_that_of_the_waves(share, k, drag, b, hz):
     assert found == pytest.approx(pipe.impedance(hz), rel=1e-8)
 
 
-def test_a_string_that_weighs_nothing_is_a_spring():
+def test_a_string_without_inertia_is_a_spring():
     m = parameters(TwoMass())
     assert np.allclose(StringShaft().impedance(np.append(m, [0.0, 0.0]), S), TwoMassShaft().impedance(m, S), rtol=1e-12)
     near, far = (StringShaft().impedance(np.append(m, [share, share]), S) for share in (1e-9, 1e-6))
@@ -80,7 +80,7 @@ def test_auto_finds_the_string():
 
 
 @pytest.mark.heavy
-def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
+def test_a_known_pipe_is_used_and_a_wrong_one_is_reported():
     plant = Pipe()
     recording = run(plant, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0]
     free, found, wrong = (
@@ -101,7 +101,7 @@ def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
 @pytest.mark.heavy
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_torque_scale_that_the_pipe_contradicts_leaves_no_inertia(factor):
-    """Every report agrees with the wrong scale; only the pipe's impedance does not. Its travel time does."""
+    """All reports and the travel time agree with the wrong scale. Only the impedance of the pipe contradicts it."""
     plant = Pipe()
     recording = run(plant, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0]
     pipe = KnownPipe(plant.inertia, plant.stiffness, 0.03, "rig.yaml")
@@ -112,8 +112,8 @@ def test_a_torque_scale_that_the_pipe_contradicts_leaves_no_inertia(factor):
     assert float(found.reason.split("has ")[1].split(" times")[0]) == pytest.approx(factor, rel=0.1)
 
 
-def test_waves_on_the_bench_meet_the_bench_s_own_impedance():
-    """The simulator's waves, one tone at a time: so that what is estimated is what the formula says."""
+def test_waves_on_the_bench_agree_with_its_impedance():
+    """The waves of the bench agree with its formula for each tone, so the formula can be the reference."""
     pipe = replace(Pipe(), motor=20.0, motor_viscous=100.0, end_viscous=40.0)
     for hz in (0.1, 0.5):
         body, count = pipe.body(1, 0.0, (0.0, 0.0)), round(100.0 / hz)
@@ -129,9 +129,11 @@ def test_waves_on_the_bench_meet_the_bench_s_own_impedance():
 @pytest.mark.heavy
 @pytest.mark.parametrize("seed", (2, 17))
 def test_a_string_must_gain_more_than_chance_gives(seed):
-    """A spring that weighs nothing, where scatter speaks for a weight: two masses stand, with intervals that hold what
-    a string would say, under any kernel of the linear algebra: whether a descent comes to the double of that string,
-    with a wave of 10 s, must change neither."""
+    """A spring without inertia, where scatter suggests an inertia: two masses are kept.
+
+    The intervals contain the result of a string. A descent may end at the double of that string with a wave of 10 s,
+    depending on the linear algebra. Neither model nor intervals may depend on this.
+    """
     plant = TwoMass()
     wrong = 1.0 + 0.01 * np.random.default_rng([seed, 1]).standard_normal(2)
     known = LagPrior(0.40 * wrong[0], 0.004, 0.15 * wrong[1], 0.0015, "the manual")
@@ -149,8 +151,8 @@ def test_a_string_must_gain_more_than_chance_gives(seed):
 
 @few
 @given(wave=st.floats(0.01, 2.0), resistance=st.floats(20.0, 500.0), end=st.floats(10.0, 1000.0), n=st.integers(1, 3))
-def test_a_string_has_a_double_that_the_lines_cannot_tell(wave, resistance, end, n):
-    """T + n/(2f), at multiples of f: the same impedance. Its lowest antiresonance is below half of f, always."""
+def test_a_string_has_a_double_with_the_same_impedance_at_the_lines(wave, resistance, end, n):
+    """With T + n/(2f) the impedance is the same at multiples of f. Its lowest antiresonance is always below f/2."""
     def pipe(wave):
         return Pipe(end=end, inertia=wave * resistance, stiffness=resistance / wave, drag=0.0)
 
@@ -162,8 +164,8 @@ def test_a_string_has_a_double_that_the_lines_cannot_tell(wave, resistance, end,
 
 
 @pytest.mark.heavy
-def test_the_double_of_a_string_does_not_stand_in_its_place():
-    """Wherever the descents begin: also at the double, where scatter makes it the likelier by a hair."""
+def test_the_double_of_a_string_does_not_replace_it():
+    """The start of a descent has no effect, even at the double, if scatter makes it slightly more likely."""
     lines, constraint = synthetic(TwoMass(), 0, 20.0)
     two = fit_compliant(TwoMassShaft(), lines, constraint, (), {})
     problem = Likelihood(lines, Model(StringShaft()), constraint, ())
@@ -179,10 +181,10 @@ def test_the_double_of_a_string_does_not_stand_in_its_place():
         ends.append(minimise(problem, limits, start, held))
     beside = fit_compliant(StringShaft(), lines, constraint, (), {}, two)
     doubles = [fit for fit in ends if string_resonances(fit.theta[:8])[0] < np.pi * LINES[0]]
-    assert min(abs(fit.objective - beside.fitted.simple.objective) for fit in doubles) < 1.0, "as good, all but"
+    assert min(abs(fit.objective - beside.fitted.simple.objective) for fit in doubles) < 1.0, "nearly as good"
     likelier = replace(doubles[0], objective=beside.fitted.simple.objective - 1.0)
     apart = too_slow(problem)
     assert lowest([likelier, beside.fitted.simple], apart) is beside.fitted.simple
     outdone = replace(doubles[0], objective=beside.fitted.simple.objective - 1.01 * chance_gain())
-    assert lowest([beside.fitted.simple, outdone], apart) is outdone, "what explains much more is not hidden"
+    assert lowest([beside.fitted.simple, outdone], apart) is outdone, "a much better fit is kept"
     assert lowest([likelier], apart) is likelier

@@ -1,4 +1,4 @@
-"""Records without periodic excitation: the interval covers, and what can't tell the inertia is refused in words."""
+"""Records without periodic excitation: the interval covers, and unsuitable records are refused with a reason."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def steps():
 # -- the equations -------------------------------------------------------------------------------------------
 
 
-def test_without_noise_the_truth_solves_every_bin():
+def test_without_noise_the_true_values_solve_every_bin():
     recording = simulate(quiet(FIELD), "ramp + coast", [1])[0]
     bins = bins_of(recording)
     truth = np.zeros(PARAMETERS)
@@ -74,8 +74,8 @@ def test_a_bin_is_the_integral_through_the_window_at_every_frequency(steps):
 
 
 @pytest.mark.parametrize(("rate_hz", "length_s"), [(20.0, 2.0), (10.0, 5.0), (20.0, 12.0), (400.0, 2.0)])
-def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, length_s):
-    """Ten samples to a taper: sums over them had been off by several percent of the torque, and J followed."""
+def test_the_true_values_solve_the_bins_of_short_stretches_at_low_rates_too(rate_hz, length_s):
+    """With ten samples per taper, sums used to be wrong by several percent of the torque, and J too."""
     rng = np.random.default_rng(3)
     count = int(rate_hz * length_s)
     time = (np.arange(count) + rng.uniform(-0.05, 0.05, count)) / rate_hz
@@ -94,8 +94,9 @@ def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, 
 
 @pytest.mark.heavy
 def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
-    """Friction's slope at the mean speed is 17 N·m·s/rad, behind a lag of 0.4 s: J had been read 5 kg·m² too large.
-    With straight friction only it is 0.2 % too large.
+    """The slope of friction at the mean speed is 17 N·m·s/rad, with a lag of 0.4 s. J used to be 5 kg·m² too large.
+
+    With linear friction only it is 0.2 % too large.
     """
     windy = replace(quiet(FIELD), viscous=2.0, quadratic=1.8)
     said = found(simulate(windy, "torque pulses", [1])[0])
@@ -105,9 +106,8 @@ def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
 
 
 @pytest.mark.heavy
-def test_lags_that_nothing_speaks_of_do_not_widen_the_interval():
-    """Reports of 6 and 5 ms: lags of a second and more on both had been held as likely as none, ±3.0 % instead of 1.2.
-    """
+def test_unsupported_lags_do_not_widen_the_interval():
+    """With lags of 6 and 5 ms, common lags of 1 s and more used to be accepted: ±3.0 % instead of ±1.2 %."""
     short = replace(FIELD, speed_report=Report((0.006,)), torque_report=Report((0.005,)))
     inertia = found(simulate(short, "up-down ramps", [3])[0]).inertia
     assert inertia.low <= 104.0 <= inertia.high
@@ -137,7 +137,7 @@ def test_tapers_add_up_to_one():
 
 @pytest.mark.heavy
 def test_what_stands_clear_beyond_the_lags_counts():
-    """Up to a radian of the longer lag stands half of what tells the lags: ±1.8 kg·m² had come of it."""
+    """Half of the information on the lags is above one radian of the longer lag. Without it J had ±1.8 kg·m²."""
     inertia = found(simulate(FIELD, "torque pulses", [3])[0]).inertia
     assert inertia.low <= 104.0 <= inertia.high
     assert inertia.high - inertia.low < 0.025 * 104.0
@@ -166,8 +166,8 @@ def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(mon
     (0.0, (0.0, 0.1)), *(
         pytest.param(*case, marks=pytest.mark.heavy) for case in ((5.0, (0.0, 0.2)), (40.0, (0.95, 1.0)))),
 ])
-def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkeypatch, gain, followed):
-    """Two shapes more that lower −2 ln L by 5 are nothing: the value had gone over to theirs from 4 on."""
+def test_the_value_follows_a_filter_structure_according_to_its_weight(monkeypatch, gain, followed):
+    """Two more shapes that reduce −2 ln L by 5 are not significant. The value used to follow them from 4 on."""
     recording = simulate(FIELD, "torque pulses", [3])[0]
     bins, placed = bins_of(recording), windows_of(recording)
     monkeypatch.setattr(solving, "best_shapes", lambda problem, near: Fit(
@@ -178,8 +178,8 @@ def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkey
 
 
 @pytest.mark.heavy
-def test_where_the_wide_band_leaves_the_inertia_open_the_narrow_one_speaks(monkeypatch):
-    """A load that is slow and strong: one start with coasting of seventy had been refused."""
+def test_if_j_is_unbounded_in_the_wide_band_the_narrow_one_is_used(monkeypatch):
+    """With a slow, strong load, one of seventy starts with coasting used to be refused."""
     recording = simulate(FIELD, "torque pulses", [3])[0]
     bins, placed = bins_of(recording), windows_of(recording)
     wide, narrow = search(bins, (), float(np.ptp(recording.torque_nm)))
@@ -202,7 +202,7 @@ def _shifted(fit, by):
 @pytest.mark.heavy
 @pytest.mark.parametrize("by", [0.99, 1.01])
 def test_the_interval_joins_that_of_one_pole_filters_in_each_band(monkeypatch, by):
-    """Undeclared pulses missed in 5 of 109 records where only the profile counted, and 2 sd of the narrow band."""
+    """With the profile and 2 sd of the narrow band only, intervals of undeclared pulses missed in 5 of 109 records."""
     recording = simulate(FIELD, "torque pulses", [3])[0]
     bins, placed, span = bins_of(recording), windows_of(recording), float(np.ptp(recording.torque_nm))
     wide, narrow = search(bins, (), span)
@@ -221,7 +221,7 @@ def test_the_interval_joins_that_of_one_pole_filters_in_each_band(monkeypatch, b
     joined = solved(wide, apart)
     assert holds(joined, apart.fit.theta[0], near)
     assert joined.high - joined.low > alone.high - alone.low
-    structured = 2.0 - by          # a structure that −2 ln L prefers by 40, on the other side
+    structured = 2.0 - by          # a structure that is better by 40 in −2 ln L, on the other side
     monkeypatch.setattr(solving, "best_shapes", lambda problem, near: replace(
         _shifted(near, structured), objective=near.objective - 40.0))
     monkeypatch.setattr(solving, "profile", lambda problem, best, *_: Estimate(
@@ -232,7 +232,7 @@ def test_the_interval_joins_that_of_one_pole_filters_in_each_band(monkeypatch, b
 
 @pytest.mark.heavy
 def test_the_rounds_leave_a_place_without_lags(monkeypatch):
-    """A skew takes a short lag's delay back, so that descents stand still there: reversing ramps had been refused."""
+    """A time offset compensates a short lag, so that descents stall. Reversing ramps used to be refused."""
     recording = simulate(FIELD, "torque pulses", [3])[0]
     bins = bins_of(recording)
     right = search(bins, (), float(np.ptp(recording.torque_nm)))[-1]
@@ -254,9 +254,7 @@ def test_the_rounds_leave_a_place_without_lags(monkeypatch):
 
 @pytest.mark.heavy
 def test_a_slow_strong_load_is_no_scatter_over_time():
-    """It is at the lowest frequencies, which count for little; cut by blocks of time it had passed for twice
-    the noise's variance.
-    """
+    """The load has the lowest frequencies, with little weight. In blocks of time it used to double the variance."""
     clean = simulate(quiet(FIELD), "torque pulses", [3], Reading(25.0))[0]
     truth = np.zeros(PARAMETERS)
     truth[:5], truth[7] = (104.0, 8.0, 0.40, 0.15, 0.0), 60.0
@@ -324,7 +322,7 @@ def test_holes_and_lost_rows_do_no_harm_and_the_bits_repeat(steps):
     assert said == found(recording)
 
 
-# -- what can't tell -----------------------------------------------------------------------------------------
+# -- unsuitable records -------------------------------------------------------------------------------------------
 
 
 def noise(recording, sd):
@@ -378,7 +376,7 @@ HOPELESS = [(constant_speed, "constant"), (coasting, "Coasting"), (no_torque, "t
 @pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("spoil", "said"), HOPELESS, ids=lambda value: getattr(value, "__name__", ""))
-def test_a_record_that_can_t_tell_is_refused_and_says_which_motion_would(steps, spoil, said):
+def test_an_unsuitable_record_is_refused_with_a_reason_and_advice(steps, spoil, said):
     refused = found(spoil(steps))
     assert refused.verdict in (Verdict.NOT_IDENTIFIABLE, Verdict.MODEL_REJECTED)
     assert refused.inertia is None
@@ -387,9 +385,11 @@ def test_a_record_that_can_t_tell_is_refused_and_says_which_motion_would(steps, 
 
 
 @pytest.mark.heavy
-def test_what_stands_beside_a_line_need_not_stand_clear():
-    """A multisine that nobody declared, in much noise: just above its last line the speed is what noise makes of it.
-    Bins there had counted as clear for their neighbours' sake, and spoken against the model."""
+def test_bins_beside_a_line_need_not_be_clear():
+    """An undeclared multisine in strong noise: just above its last line the speed is noise only.
+
+    Bins there used to count as clear because of their neighbours, and contradicted the model.
+    """
     plant = plants.CoveragePlant(
         "lines", "noise of 3 % of the torque limit", 178.0, 5.0, 30.0, (1.0, 11.7), 435.0,
         plants.ReportFilter((0.06, 0.04)), plants.ReportFilter((0.03,)),

@@ -1,4 +1,4 @@
-"""Two masses on a spring: the impedance against the equations of motion, and what is found in recordings."""
+"""Two masses on a spring: impedance compared with the equations of motion, and results from recordings."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def parameters(plant):
 
 
 def synthetic(plant, seed, noise_nm, hertz=LINES, amplitude=0.2, lags=(0.4, 0.15)):
-    """Lines as six periods about each of two mean speeds would leave them, and B from the levels."""
+    """Return lines as from six periods about each of two mean speeds, and B from the operating points."""
     rng, found = np.random.default_rng(seed), []
     for hz in hertz:
         s = 2j * np.pi * hz
@@ -74,7 +74,7 @@ def test_impedance_solves_the_equations_of_motion(motor, load, k, c, b, hz):
     assert found == pytest.approx(plant.impedance(hz), rel=1e-9)
 
 
-def test_slow_motion_turns_both_and_fast_motion_the_motor_alone():
+def test_slow_motion_has_both_inertias_and_fast_motion_the_motors_only():
     plant = replace(TwoMass(), damping=0.0, load_viscous=0.0)
     slow, fast = TwoMassShaft().impedance(parameters(plant), 2j * np.pi * np.array([1e-3, 50.0])).imag
     assert slow == pytest.approx(plant.total * 2e-3 * np.pi, rel=1e-4)
@@ -110,7 +110,7 @@ def test_jacobian_is_the_derivative_through_every_view(shaft, view):
 
 
 @pytest.mark.parametrize("view", (None, TOTAL, STIFFNESS, RESONANCE), ids=("plain", "total", "stiffness", "resonance"))
-def test_what_is_known_of_a_pipe_has_its_derivative_through_every_view(view):
+def test_a_known_pipe_has_its_derivative_through_every_view(view):
     pipe = Pipe(215.0, 410.0, 0.03)
     shaft, m = KnownStringShaft(pipe), np.append(parameters(TwoMass()), [0.3, 0.6])
     m[2], m[3] = 215.0 / 0.3, np.sqrt(410.0 / (215.0 / 0.3 * 0.8))
@@ -146,13 +146,13 @@ def test_auto_finds_two_masses_and_says_so(recording):
     assert shaft.load_inertia.value == pytest.approx(374.0, rel=0.1)
     assert shaft.stiffness_nm_rad.value == pytest.approx(473.0, rel=0.1)
     assert shaft.total_inertia.value == pytest.approx(1874.0, rel=0.01)
-    # seeded: within twice the interval's reach in any case
+    # seeded: always within twice the half-width
     for one, truth in ((found.inertia, 1500.0), (shaft.total_inertia, 1874.0), (shaft.load_inertia, 374.0)):
         assert abs(one.value - truth) < one.high - one.low
     stated = dict(zip(shaft.covariance.quantities, np.sqrt(np.diag(shaft.covariance.matrix)), strict=True))
     for name, one in (("inertia_kg_m2", found.inertia), ("load_inertia_kg_m2", shaft.load_inertia),
                       ("stiffness_nm_rad", shaft.stiffness_nm_rad)):
-        assert 0.0 < 1.96 * stated[name] < 1.5 * 0.5 * (one.high - one.low)      # the interval may also hold a string
+        assert 0.0 < 1.96 * stated[name] < 1.5 * 0.5 * (one.high - one.low)      # it may also contain a string
     assert "contradict a rigid shaft" in found.reason or "residuals contradict" in found.reason
     assert any("resonance at 0.2 Hz lies inside the excited band" in warning for warning in found.warnings)
     half = 0.5 * (found.inertia.high - found.inertia.low)
@@ -161,8 +161,8 @@ def test_auto_finds_two_masses_and_says_so(recording):
 
 
 @pytest.mark.heavy
-def test_where_a_string_isn_t_excluded_and_widens_most_it_is_asked_what_swings():
-    """At 0.4 Hz: a string that weighs as much as the load has its second swing above all lines."""
+def test_if_a_string_is_possible_and_widens_most_the_user_is_asked_for_the_load():
+    """A string as heavy as the load has its second resonance above all lines at 0.4 Hz."""
     stiffer = run(replace(TwoMass(), stiffness=4.0 * 473.0, damping=2.0 * 23.2), [3])[0]
     found = identify(stiffer, Options(tolerance=0.01))
     assert found.verdict is Verdict.VALID_WIDE
@@ -191,8 +191,8 @@ def test_the_same_recording_gives_the_same_bits(recording):
 
 
 @pytest.mark.heavy
-def test_intervals_hold_over_seeds():
-    """Of five seeds and four quantities at 95 %, four misses or more would have a chance of 2 %."""
+def test_intervals_cover_over_seeds():
+    """With five seeds and four quantities at 95 %, four or more misses have a probability of 2 %."""
     plant, misses = TwoMass(), 0
     truth = {"inertia": plant.motor, "load": plant.load, "stiffness": plant.stiffness, "total": plant.total}
     for seed in range(5):
@@ -206,7 +206,7 @@ def test_intervals_hold_over_seeds():
 
 
 def test_a_resonance_just_above_the_band_is_no_rigid_shaft():
-    """Rejected outright, or doubted and then explained by a load that oscillates."""
+    """The rigid model is rejected, or doubted and then replaced by an oscillating load."""
     plant = TwoMass(83.0, 21.0, 21.0 * (2.0 * np.pi * 0.55) ** 2, 2.0, 6.0, 2.0)
     for seed in range(3):
         lines, constraint = synthetic(plant, seed, 1.0, (0.05, 0.1, 0.15, 0.25, 0.35, 0.5))
@@ -216,8 +216,10 @@ def test_a_resonance_just_above_the_band_is_no_rigid_shaft():
 
 @pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.heavy), pytest.param(5, marks=pytest.mark.long)])
 def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line(seed):
-    """At 0.08 Hz the load takes the motor's motion away: two lines have torque and hardly speed, the other nine fit a
-    rigid shaft, with an inertia that is neither the motor's nor the whole's."""
+    """The load absorbs the motion of the motor at 0.08 Hz: two lines have torque and hardly any speed.
+
+    The other nine lines fit a rigid shaft, with an inertia that is neither the motor's nor the total one.
+    """
     total = TwoMass().total
     plant = TwoMass(motor=0.7 * total, load=0.3 * total, stiffness=0.3 * TwoMass().stiffness)
     (recording,) = run(plant, [seed], noise=Noise(), lags_s=(0.40, 0.15), settle=4)
@@ -229,7 +231,7 @@ def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line(seed):
 
 @pytest.mark.heavy
 def test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_difference():
-    """The load's dry friction changes sign there at the slower mean speed alone, and nowhere else."""
+    """The dry friction of the load changes its sign only at this line and at the slower mean speed."""
     plant = TwoMass()
     lines, constraint = synthetic(plant, 2, 20.0, (0.05, 0.1, 0.18, 0.35, 0.7))
     swing = next(index for index, line in enumerate(lines) if line.hertz == 0.18)
@@ -249,7 +251,7 @@ def test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_differ
 
 @pytest.mark.heavy
 def test_what_is_known_of_a_pipe_counts_as_equations():
-    """Four lines and two mean speeds: nine, for the eleven unknowns of a string behind lags."""
+    """Four lines and two mean speeds give nine equations for the eleven unknowns of a string with lags."""
     plant = PipeBench()
     lines, constraint = synthetic(plant, 1, 5.0, (0.07, 0.2, 0.4, 0.7))
     known = Pipe(plant.inertia, plant.stiffness, 0.03, "rig.yaml")
@@ -271,7 +273,7 @@ def test_too_few_lines_are_counted_and_refused():
 
 @pytest.mark.heavy
 def test_the_covariance_of_the_fit_is_the_scatter_over_seeds():
-    """Of 24 seeds: standard deviations within a factor of 1.6, and the sign of each clear correlation."""
+    """With 24 seeds, the standard deviations agree within a factor of 1.6, and the clear correlations in sign."""
     fits = [fit_compliant(TwoMassShaft(), *synthetic(TwoMass(), seed, 20.0), (), {}) for seed in range(24)]
     stated = [shaft_covariance(fit) for fit in fits]
     names = stated[0].quantities
@@ -284,5 +286,5 @@ def test_the_covariance_of_the_fit_is_the_scatter_over_seeds():
     assert np.all((ratios > 1.0 / 1.6) & (ratios < 1.6))
     promised, seen = (one / np.sqrt(np.outer(np.diag(one), np.diag(one))) for one in (mean, np.cov(found.T)))
     clear = np.abs(promised) > 0.5
-    assert clear.sum() > len(names)          # besides the diagonal
+    assert clear.sum() > len(names)          # more than the diagonal
     assert np.all(promised[clear] * seen[clear] > 0.0)

@@ -1,4 +1,4 @@
-"""Small logs of a run that state whatever a log may state, in milliseconds; what identification finds is played."""
+"""Small logs with every possible entry, made in milliseconds, with a simulated result of the identification."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ PROFILE = {
        for number, name in enumerate(("identity", "modes", "quick_stop", "speed", "torque", "watchdog"))},
 }
 LSS = ((0x7E4, 0x5D, bytes(3)), (0x7E5, 0x43, bytes(3)), (0x7E5, 0x4A, bytes(3)), (0x7E5, 0x51, b"\x08\x03\x00"))
-"""Frames of LSS with a serial number: identifier, command, and what follows the number (CiA 305)."""
+"""Frames of LSS with a serial number: identifier, command, and the bytes after the number (CiA 305)."""
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
 
 def found(log: Path) -> dict[str, Any]:
-    """What a replay finds, without one."""
+    """Return the result of a replay, without a replay."""
     return dict(RESULT)
 
 
@@ -47,7 +47,7 @@ def configuration(**more: Any) -> dict[str, Any]:
 def write_run(path: Path, run: dict[str, Any] | None = None, *, simulated: bool = False,
               events: tuple[Event, ...] = (), result: dict[str, Any] | None = None, serial: int = SERIAL,
               stages: tuple[str, ...] = STAGES) -> Path:
-    """A whole log of a run with 40 samples; the drive reports its serial number in a frame."""
+    """Write a complete log of a run with 40 samples. The drive reports its serial number in a frame."""
     with RunWriter(path, epoch_ns=1_772_000_000 * 10**9, block=True) as writer:
         writer.configuration(configuration() if run is None else run, {"gear_ratio": 2.0, "simulated": simulated})
         writer.frame(RawFrame(0.0, False, 0x581, b"\x43\x18\x10\x04" + serial.to_bytes(4, "little")))

@@ -1,4 +1,4 @@
-"""The contract of an archive: same content, same bytes; each change of it is found; what it may not be made from."""
+"""Contract of an archive: same bytes for the same content, detection of each change, and refused inputs."""
 
 from __future__ import annotations
 
@@ -124,14 +124,14 @@ def test_bytes_beside_the_members_are_found(made):
 
 
 def with_record(log: bytes, opcode: int, body: bytes) -> bytes:
-    """The log with one more record behind its header."""
+    """Return the log with one more record after its header."""
     (length,) = struct.unpack_from("<Q", log, len(MAGIC) + 1)
     at = len(MAGIC) + 9 + length
     return log[:at] + struct.pack("<BQ", opcode, len(body)) + body + log[at:]
 
 
 @pytest.mark.parametrize(("opcode", "named"), [(0x09, "an attachment"), (0x0C, "metadata"), (0x0D, "record 0Dh")])
-def test_an_attachment_or_metadata_in_the_log_is_found_and_not_taken(made, tmp_path, opcode, named):
+def test_an_attachment_or_metadata_in_the_log_is_found_and_removed(made, tmp_path, opcode, named):
     log = with_record(made.members["run.mcap"], opcode, b"\4\0\0\0Jane")
     assert any(named in one for one in problems(changed(made, "run.mcap", log)))
     (tmp_path / "run.mcap").write_bytes(with_record(write_run(tmp_path / "a.mcap").read_bytes(), opcode, b"Jane"))
@@ -152,7 +152,7 @@ def test_a_private_text_in_the_statement_is_refused_and_not_repeated(tmp_path, t
     assert text not in str(caught.value)
 
 
-# -- completeness, and what is no evidence
+# -- completeness, and refused inputs
 
 
 @pytest.mark.parametrize(("change", "said"), [
@@ -160,13 +160,13 @@ def test_a_private_text_in_the_statement_is_refused_and_not_repeated(tmp_path, t
     ({"ended": {"kind": "LimitHit", "what": "speed"}}, "the end of the run"),
     ({"trace": {"assumed": []}}, "a trace of another tool"), ({"faults": ["sto@hold"]}, "a rehearsal"),
 ])
-def test_what_is_missing_is_named(tmp_path, change, said):
+def test_missing_parts_are_named(tmp_path, change, said):
     run = {name: value for name, value in configuration(**change).items() if value is not None}
     with pytest.raises(UsageError, match=said):
         make_evidence(write_run(tmp_path / "run.mcap", run), STATEMENT, (), conclude=found)
 
 
-def test_a_run_without_the_stage_that_identifies_or_a_cut_log_is_refused(tmp_path):
+def test_a_run_without_stage_5_or_a_truncated_log_is_refused(tmp_path):
     log = write_run(tmp_path / "run.mcap", stages=("setup", "speed"))
     with pytest.raises(UsageError, match="stage acquire"):
         make_evidence(log, STATEMENT, (), conclude=found)
@@ -229,7 +229,7 @@ def test_a_statement_is_read_back_as_it_is():
 
 
 def test_each_option_is_on_the_form_of_the_service():
-    """The service knows itself whether a run is simulated."""
+    """The option for simulated runs is not on the form, since the service detects them."""
     assert [one.name for one in form_options("evidence")] == [
         one.name for one in OF_EVIDENCE if one.name != "simulated"]
     assert all(one.help and one.api is True for one in OF_EVIDENCE)
@@ -261,7 +261,7 @@ def shown(run=None, statement=STATEMENT, result=RESULT, torque_mode=True):
     return set(shown_entries(run or configuration(), statement, result, torque_mode=torque_mode))
 
 
-def test_a_run_shows_the_entries_whose_effect_was_seen():
+def test_a_run_is_evidence_for_entries_with_an_observed_effect():
     assert shown() == {"modes", "quick_stop", "speed", "torque"}       # not the watchdog, which was read back only
     assert shown(torque_mode=False) == {"quick_stop", "speed", "torque"}
     assert shown(configuration(speed_unit={})) == {"modes", "quick_stop", "torque"}
@@ -274,7 +274,7 @@ def test_a_run_shows_the_entries_whose_effect_was_seen():
     assert shown(result=RESULT | {"verdict": "not_identifiable"}) == {"quick_stop", "speed"}
 
 
-def test_an_event_of_a_mode_is_what_shows_it(tmp_path):
+def test_an_event_of_a_mode_is_its_evidence(tmp_path):
     log = write_run(tmp_path / "run.mcap", events=(Event(0.6, "note", "torque mode confirmed"),))
     made = make_evidence(log, STATEMENT, (), conclude=found)
     assert set(json.loads(made.members["manifest.json"])["shown"]) == {"modes", "quick_stop", "speed", "torque"}

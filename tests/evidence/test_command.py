@@ -1,4 +1,4 @@
-"""`tdhil evidence`: what it needs, what it writes, how its check ends."""
+"""`tdhil evidence`: required inputs, written files, and the end of its check."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_permission_is_never_assumed(log, tmp_path):
     (("--check", "y.zip", "--sha256", "3f0c…"), "'3f0c…' is not a SHA-256, which has 64 hexadecimal digits"),
     (("--check", "y.zip", "--sha256", ""), "Nothing was checked"),
 ])
-def test_wrong_use_is_said(words, said):
+def test_usage_errors_are_reported(words, said):
     done = tdhil("evidence", *words)
     assert done.code == 2 and said in done.err
 

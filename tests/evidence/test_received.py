@@ -1,4 +1,4 @@
-"""The archives in `evidence/`: each passes its check with its digest, is replayed, and stands behind what names it."""
+"""Archives in `evidence/`: each passes its check with its digest, is replayed, and supports the entries naming it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def document(path: Path, name: str):
 
 
 def claims(profile) -> dict[str, str]:
-    """Entries of a profile that name an archive as their source, with the archive's name."""
+    """Return the entries of a profile that name an archive as their source, with the name of the archive."""
     return {name: named[1] for name, part in profile.items()
             if isinstance(part, dict) and (named := NAMED.search(str(part.get("source", ""))))}
 
@@ -52,7 +52,7 @@ def test_an_archive_is_identified_again_from_its_log(path):
     assert check_evidence(path.read_bytes(), digests()[path.name]).problems == ()
 
 
-def test_the_example_is_small_and_marked_and_shows_nothing():
+def test_the_example_is_small_and_marked_and_supports_no_entry():
     (example,) = [path for path in RECEIVED if document(path, "manifest.json")["simulated"]]
     assert example.name == "simulated-example.zip" and example.stat().st_size < LARGEST_EXAMPLE
     assert members_in(example.read_bytes())["README.txt"].startswith(b"SIMULATED")
@@ -63,7 +63,7 @@ def test_the_example_is_small_and_marked_and_shows_nothing():
 
 @pytest.mark.parametrize("name", profile_names())
 def test_an_entry_that_names_an_archive_is_shown_by_it(name):
-    """And an entry that an archive shows is no longer only likely."""
+    """An entry that an archive supports must have the confidence verified."""
     today = load_profile(name).model_dump(mode="json", by_alias=True)
     for entry, archive in claims(today).items():
         assert entry in covered(FOLDER / archive, today), f"{name}: {entry} is not shown by {archive}"

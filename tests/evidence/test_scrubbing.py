@@ -1,4 +1,4 @@
-"""No name, path, address or serial number of the input stands in any byte of an archive, compressed parts decoded."""
+"""Scrubbing: no name, path, address or serial number of the input is in any byte of an archive, decompressed."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ STATEMENT = PublisherStatement("The Institute", ("log", "result", "identity"), N
 NAMES = ("first", "last", "rig", "host", "user", "folder", "file", "note", "secret", "key", "field", "mail",
          "calibrated", "customer", "order", "place", "text")
 WORD = st.text(string.ascii_lowercase, min_size=6, max_size=12).map(lambda text: f"q{text}x")
-FOLDER = "/ho" "me"      # written so that no path of a home stands in the tree
+FOLDER = "/ho" "me"      # split, so that no home path is in the tree
 
 
 def seeded(path: Path, words: dict[str, str], serial: int) -> Path:
-    """A log that states each word wherever a log may state one."""
+    """Write a log with each word at every possible place."""
     w, home = words, f"{FOLDER}/{words['user']}/{words['folder']}"
     run = configuration(
         operator=f"{w['first']} {w['last']}", note=f"at {w['note']}", customer=f"{w['customer']} AS",
@@ -64,7 +64,7 @@ def seeded(path: Path, words: dict[str, str], serial: int) -> Path:
 
 
 def with_more(path: Path, words: dict[str, str]) -> Path:
-    """The same log with a field in each command that tdhil does not know."""
+    """Return the same log with an unknown field in each command."""
     unknown = b"\xfa\x01" + bytes([len(words["field"])]) + words["field"].encode()       # field 31, a text
     with path.with_suffix(".more").open("wb", buffering=0) as file:
         container = Container(file)
@@ -77,7 +77,7 @@ def with_more(path: Path, words: dict[str, str]) -> Path:
 
 
 def every_byte(archive: bytes, log: bytes, at: Path) -> bytes:
-    """The archive, and the chunks of its log decompressed."""
+    """Return the archive and the decompressed chunks of its log."""
     at.write_bytes(log)
     with at.open("rb") as file:
         chunks = [one.data for one in walk(file, len(log)) if isinstance(one, Contents)]
@@ -87,7 +87,7 @@ def every_byte(archive: bytes, log: bytes, at: Path) -> bytes:
 
 @settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow], phases=[Phase.generate])
 @given(st.lists(WORD, min_size=len(NAMES), max_size=len(NAMES), unique=True), st.integers(10**6, 2**32 - 2))
-def test_nothing_private_of_the_input_stands_in_any_byte(drawn, serial):
+def test_no_private_text_of_the_input_is_in_any_byte(drawn, serial):
     words = dict(zip(NAMES, drawn, strict=True))
     with TemporaryDirectory() as folder:
         log = seeded(Path(folder) / "run.mcap", words, serial)
@@ -110,7 +110,7 @@ def scrubbed(tmp_path):
     return log, tmp_path / "scrubbed.mcap", made
 
 
-def test_what_identification_needs_stays(scrubbed):
+def test_data_for_the_identification_are_kept(scrubbed):
     before, after = (read_run(path) for path in scrubbed[:2])
     for name in ("time_s", "speed_rad_s", "torque_nm", "fresh"):
         assert (getattr(before.recording, name) == getattr(after.recording, name)).all()
@@ -142,7 +142,7 @@ def test_equal_drives_stay_equal_and_different_ones_different(scrubbed):
     (0x7E4, "5c07000000000000"), (0x7E5, "5107000000080200"),           # a revision
     (0x181, "43d2029649000000"), (0x7E4, "5dd2"), (0x7E4, ""),
 ])
-def test_other_frames_stay(identifier, data):
+def test_other_frames_are_kept(identifier, data):
     assert LogScrub(configuration()).frame(bytes.fromhex(data), identifier).hex() == data
 
 
@@ -151,7 +151,7 @@ def test_scrubbing_again_changes_nothing(scrubbed):
     assert all(again.message(channel, payload) == payload for channel, payload in messages_of(scrubbed[1]))
 
 
-def test_the_rig_s_name_stays_where_it_is_permitted(tmp_path):
+def test_the_rig_s_name_is_kept_if_permitted(tmp_path):
     log = write_run(tmp_path / "run.mcap", configuration(bench={"name": "Rig 7 of Acme", "limits": {}},
                                                          unverified=["seen on Rig 7 of Acme"]))
     permitted = PublisherStatement("The Institute", ("log", "rig"), None, "", False)
@@ -174,7 +174,7 @@ def test_a_word_that_the_publisher_names_is_removed_everywhere():
     "see 1600h, 1A00h (ok); 5FFEh:2; found 10/20; profile generic/cia402; ISO 13528:2022; std::vector",
     "rig.yaml:7 and run.mcap; https://www.abb.com/doc/3AUA0000098062; torque and/or speed; 1/(J s)",
 ])
-def test_ordinary_texts_are_no_leak(text):
+def test_normal_texts_are_no_leak(text):
     assert without_leaks(text) == text and leaks_in([text]) == ()
 
 
@@ -192,7 +192,7 @@ def test_a_leak_is_found_and_removed(text, kind):
     assert without_leaks(without_leaks(text)) == without_leaks(text)
 
 
-def test_each_kind_of_leak_has_a_mark_that_is_none():
+def test_the_mark_of_each_kind_of_leak_is_no_leak():
     assert leaks_in([one.mark for one in LEAKS]) == ()
 
 

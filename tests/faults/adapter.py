@@ -1,4 +1,4 @@
-"""A python-can bus between host and virtual bus, which does what adapters and kernels do when things go wrong."""
+"""python-can bus between host and virtual bus that shows the faults of adapters and kernels."""
 
 import errno
 from collections import deque
@@ -7,14 +7,14 @@ import can
 
 
 class Adapter:
-    """``on_frame`` is called before every frame that goes out. ``sent`` counts those that reached the bus."""
+    """Adapter that calls ``on_frame`` before every transmitted frame. ``sent`` counts those that reach the bus."""
 
     def __init__(self, bus):
         self._bus = bus
         self.channel_info = bus.channel_info
         self.coming = deque()
         self.error = None              # raised by send and recv from now on
-        self.full = False              # the transmit queue is: ENOBUFS
+        self.full = False              # the transmit queue is full: ENOBUFS
         self.queued = None             # a list: frames go there, not on the bus
         self.on_frame = lambda message: None
         self.tried, self.sent = [], []
@@ -40,11 +40,11 @@ class Adapter:
         return self._bus.recv(timeout)
 
     def error_frame(self, classes, state=0):
-        """As SocketCAN delivers one: classes in the identifier, the controller's state in byte 1."""
+        """Return an error frame of SocketCAN: classes in the identifier, the controller's state in byte 1."""
         self.coming.append(can.Message(arbitration_id=classes, data=[0, state, 0, 0, 0, 0, 0, 0], is_error_frame=True))
 
     def deliver(self):
-        """The queue goes out, late."""
+        """Transmit the queue late."""
         queued, self.queued = self.queued or [], None
         for message in queued:
             self._bus.send(message)

@@ -3,7 +3,7 @@ import pytest
 
 @pytest.fixture
 def seen(request):
-    """Keeps what a test saw of a row, for `benchmarks/fault_table.py`: ``seen(row, said, standstill_s, log)``."""
+    """Record the result of a row for `benchmarks/fault_table.py`: ``seen(row, said, standstill_s, log)``."""
     from tests.faults.seen import Seen
 
     return Seen(request.node.nodeid)
@@ -11,7 +11,7 @@ def seen(request):
 
 @pytest.fixture
 def rehearse(no_bus_of_the_user, tmp_path):
-    """`tdhil identify --simulate` in this process: ``rehearse(*arguments)``, see `rehearsal`."""
+    """Run `tdhil identify --simulate` in this process: ``rehearse(*arguments)``, see `rehearsal`."""
     from tests.faults.rehearsal import run
 
     return lambda *arguments: run(tmp_path, *arguments)

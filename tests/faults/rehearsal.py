@@ -1,6 +1,6 @@
-"""A run of the whole path in one process, stepped, with a fault in it; and what its true shaft, exit and log must show.
+"""Run of the whole path in one process, in stepped time, with a fault; and the checks of true shaft, exit and log.
 
-Times are the plant's own, from the simulator's trace.
+Times are plant times from the simulator's trace.
 """
 
 from dataclasses import dataclass
@@ -20,16 +20,16 @@ TURNING_RAD_S = 0.02
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 NOTICED_AT_ONCE_S = 0.1        # five cycles
 FEEDBACK_S = 0.4               # a quarter of a second without feedback
-WATCHDOG_S = 0.6               # the drive's own, and a cycle
+WATCHDOG_S = 0.6               # time-out of the drive, and a cycle
 CONTRADICT = ("contradict each other",)
 
 
 @dataclass(frozen=True)
 class Case:
-    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go).
+    """``ends``: refused (no motion), held (torque until standstill), coasts (the drive is disabled in motion).
 
-    ``backwards_rad_s``: so fast a wrong sensor or power stage may turn the shaft backwards before that is noticed.
-    ``free_rad_s``: so fast the shaft may turn while the drive is off.
+    ``backwards_rad_s``: reverse speed that a wrong sensor or power stage may cause before it is found.
+    ``free_rad_s``: speed that is allowed while the drive is disabled.
     """
 
     row: int
@@ -50,7 +50,7 @@ class Case:
 
 @dataclass
 class Rehearsed:
-    """One run, over."""
+    """One completed run."""
 
     done: Finished
     shaft: Shaft
@@ -58,12 +58,12 @@ class Rehearsed:
 
     @property
     def message(self):
-        """What ended the run: one line with what, where and what next."""
+        """Return the cause of the end of the run: one line with cause, place and next step."""
         return self.done.document["error"]["message"]
 
     @property
     def fault_s(self):
-        """When the first scripted fault began."""
+        """Return the time at which the first scripted fault began."""
         return self.shaft.events("fault: ")[0]
 
     def standstill_s(self, since_s):
@@ -74,7 +74,7 @@ class Rehearsed:
         for word in words:
             assert word in self.message, self.message
         assert "Traceback" not in self.done.err
-        claimed = "The shaft was stopped" in self.message      # only a confirmed stop may be claimed
+        claimed = "The shaft was stopped" in self.message      # the report states only a confirmed stop
         assert not (claimed and code == ExitCode.STOP_NOT_CONFIRMED), self.message
 
     def assert_nothing_moved(self):
@@ -82,10 +82,10 @@ class Rehearsed:
         assert "nothing has moved" in self.done.err or "shaft is at standstill" in self.done.err
 
     def assert_stopped(self, since_s, notice_s, *, held=True, backwards_rad_s=0.3, free_rad_s=0.05):
-        """Within the time to notice it, the ramp and the settling; never let go while it turned, but by the drive.
+        """Assert a stop within detection time, ramp and settling. Only the drive itself may disable a turning shaft.
 
-        ``backwards_rad_s``: how fast it may turn backwards; a sign probe the wrong way round is the worst of it where
-        the drive's own sensor and power stage are good.
+        ``backwards_rad_s``: allowed reverse speed. With a good sensor and power stage, the largest is that of a sign
+        probe in the wrong direction.
         """
         shaft = self.shaft
         after = shaft.time_s >= since_s
@@ -100,7 +100,7 @@ class Rehearsed:
         return round(self.standstill_s(since_s), 2)
 
     def assert_as(self, case):
-        """Ended with the words of a case, and the shaft did as it says; return the time to standstill, if it moved."""
+        """Assert message and motion of a case; return the time to standstill if the shaft moved."""
         self.assert_ended(case.code, *case.words)
         if case.ends == "refused":
             self.assert_nothing_moved()
@@ -111,7 +111,7 @@ class Rehearsed:
         )
 
     def assert_log_whole(self):
-        """Finalised: recovery has nothing to do, and the stages in it are those that were reported."""
+        """Assert a finalised log that needs no recovery, and whose stages are the reported ones."""
         run = read_run(self.log)
         assert run.complete
         assert tdhil("recover", self.log).code == 0
@@ -122,15 +122,15 @@ class Rehearsed:
 
 def run(folder, *arguments):
     trace = folder / "shaft.csv"
-    # At 50 Hz a run costs a fifth of what it costs at the drive's usual rate; periods decide how long stage 5 is.
+    # At 50 Hz a run takes a fifth of its usual computing time. The periods determine the length of stage 5.
     done = identify(folder, "--simulate", "--seed", 1, "--rate", 50, "--periods", 3, "--trace", trace, *arguments)
     return Rehearsed(done, Shaft.read(trace) if trace.exists() else None, folder / "run.mcap")
 
 
 def at(monkeypatch, stage, after_s, act):
-    """Have ``act(sample)`` called once, so long after a stage has begun, between two cycles of the control loop.
+    """Call ``act(sample)`` once, at a time after the start of a stage, between two cycles of the control loop.
 
-    The plant time of that goes into the list that is returned.
+    The returned list receives the plant time of the call.
     """
     begun, acted = [], []
     started, cycle = LiveDisplay.stage_started, LiveDisplay.cycle

@@ -1,4 +1,4 @@
-"""One row of the fault table."""
+"""Row of the fault table."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ HERE = "tests/faults/"
 
 @dataclass(frozen=True)
 class Row:
-    """``codes``: how the process may end. ``said``: what tests elsewhere show, where none here measures it."""
+    """Row. ``codes``: allowed exit codes. ``said``: findings of other tests, if no test here measures the row."""
 
     fault: str
     expected: str

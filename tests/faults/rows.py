@@ -1,7 +1,7 @@
-"""The faults that a run must survive, the fifty and those beyond: what each is, what must happen, and its tests.
+"""Faults that a run must survive, the fifty and those beyond: cause, required reaction and tests of each.
 
 R refuse before the shaft has moved · QS the stop sequence · WD the drive's own watchdog stops the shaft · M finish, but
-mark what was degraded. The code is that of the cause, and 8 wherever the host could not see the shaft at rest.
+mark degraded stages. The exit code is that of the cause, or 8 if the host could not confirm standstill.
 """
 
 from tests.faults.row import HERE, Row, must

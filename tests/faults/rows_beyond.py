@@ -1,4 +1,4 @@
-"""What was found beyond the fifty by trying it on the rig floor, numbered on from 51, a section a room."""
+"""Faults beyond the fifty that trials found, numbered from 51, with one section per room."""
 
 from tests.faults.row import HERE, Row, must
 

@@ -1,4 +1,4 @@
-"""What tests saw of the rows of the fault table, a JSON line each, where TDHIL_FAULT_TABLE names a file."""
+"""Results of tests of the fault table, one JSON line each, in the file that TDHIL_FAULT_TABLE names."""
 
 import json
 import os
@@ -9,17 +9,17 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Seen:
-    """Of one test."""
+    """Recorder of the results of one test."""
 
     test: str
 
     def __call__(self, row, said, standstill_s=None, log="", code=None):
-        """``standstill_s``: plant time from the fault to the last movement of the true shaft."""
+        """Record a result. ``standstill_s``: plant time from the fault to the last movement of the true shaft."""
         path = os.environ.get("TDHIL_FAULT_TABLE")
         if not path:
             return
         said = re.sub(r"Virtual bus channel tdhil-[0-9a-f]+", "virtual bus", said)
-        said = re.sub(r"\bec[0-9]+h[0-9]+\b", "eth1", said)       # a pair of interfaces of its own
+        said = re.sub(r"\bec[0-9]+h[0-9]+\b", "eth1", said)       # its own pair of interfaces
         line = {"row": row, "test": self.test, "said": said, "standstill_s": standstill_s, "log": log, "code": code}
         with Path(path).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-"""`tdhil identify --drive ethercat --simulate --fault …`: rehearsed end to end, over a pair of veth interfaces."""
+"""End-to-end rehearsal of `tdhil identify --drive ethercat --simulate --fault …` over a pair of veth interfaces."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from tests.path.path_runs import INERTIA, QUICK, host, wait_for
 
 _segment = pytest.fixture(scope="module", autouse=True)(segment)
 
-READ_BACK_S = 6.0              # ten questions without an answer
+READ_BACK_S = 6.0              # ten requests without a reply
 
 CASES = (
     Case(12, "bus-dead" + IN_MOTION, 8, ("no feedback", "drive's own watchdog"), notice_s=WATCHDOG_S),
@@ -73,7 +73,7 @@ def test_row(case, rehearse, seen):
     (125, "mailbox-timeout@speed+15s/2s", "ok"),
 ])
 def test_row_with_a_run_that_goes_on(row, fault, outcome, rehearse, seen):
-    """J's interval still holds the truth."""
+    """The interval of J contains the true value."""
     run = rehearse("--drive", "ethercat", "--fault", fault)
     document = run.done.document
     assert run.done.code == 0, run.done.err
@@ -89,7 +89,7 @@ KILLED_IN = ("setup", "speed", "torque", "hold", "acquire")
 
 
 def stands(shaft):
-    """Before it is enabled, the plant's time stands as well."""
+    """Return whether the shaft is at standstill. The plant time does not advance before the drive is enabled."""
     moved = shaft.at_rest_from() > 0.0
     return shaft.state[-1] != "operation enabled" and (
         not moved or shaft.time_s[-1] > shaft.at_rest_from() + 1.5)
@@ -100,7 +100,7 @@ def stands(shaft):
     for stage in KILLED_IN for number in range(4)
 ])
 def test_row_4_killed(tmp_path, stage, number):
-    """20 kills: the watchdog of the process data expires, and the drive stops the shaft."""
+    """The watchdog of the process data expires in each of 20 kills, and the drive stops the shaft."""
     with simulated_drive(tmp_path, "--seed", 1 + number, "--stepped") as drive:
         with host(tmp_path, *drive.options, *QUICK, "--stepped") as running:
             assert running.wait_for_line(f"stage {stage} …"), running.err

@@ -1,6 +1,6 @@
-"""Rows of the fault table that guard, bench and runner answer for, each on a scripted drive, in each stage.
+"""Rows of the fault table that guard, bench and runner handle, each on a scripted drive, in each stage.
 
-What counts is the end: the shaft at rest and disabled, or left to the drive's own watchdog where it can't be reached;
+The tests check the end of the run: a shaft at standstill and disabled, or left to the watchdog of a lost drive;
 the first cause; the exit code.
 """
 
@@ -18,14 +18,14 @@ from tdhil.runner.task import STAGES
 from tests.runner.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
 
 IN_STAGE = 60
-"""Cycles into a stage at which its fault begins."""
+"""Cycles from the start of a stage to its fault."""
 AT_REST_S = 12.0
-"""From the fault to standstill, at most: ten rad/s at 2 rad/s², and what it takes to notice."""
+"""Longest time from the fault to standstill: 10 rad/s at 2 rad/s², plus the detection time."""
 
 
 @dataclass
 class Ended:
-    """A run and what it left."""
+    """A run and its results."""
 
     here: World
     result: object
@@ -37,13 +37,13 @@ class Ended:
 
     @property
     def speeds(self):
-        """True speeds of the shaft, every cycle up to the end of the run."""
+        """Return the true speeds of the shaft in each cycle up to the end of the run."""
         return self.here.speeds
 
     def assert_stopped(self, cause, code, what="", *, soon=True):
-        """By the one stop sequence: never disabled while it turned, torque off at the end.
+        """Assert the stop sequence: never disabled in motion, and without torque at the end.
 
-        ``soon``: the fault shows at once. Some show only when a later stage asks for what is broken.
+        ``soon``: the fault has an effect at once. Some faults have an effect only in a later stage.
         """
         assert isinstance(self.result.cause, cause), self.result.cause
         assert self.code is code
@@ -65,7 +65,7 @@ class Ended:
 
 
 def run(stage, begin, drive=None, limits=LIMITS, **options):
-    """A run in which ``begin(world)`` is called ``IN_STAGE`` cycles into a stage."""
+    """Run, and call ``begin(world)`` ``IN_STAGE`` cycles after the start of a stage."""
     here = World(drive or FakeDrive(), limits)
     at = []
 
@@ -85,7 +85,7 @@ def run(stage, begin, drive=None, limits=LIMITS, **options):
 
 
 def from_now_on(change):
-    """A beginning: every later sample is changed so, until the host stops."""
+    """Return a ``begin`` that applies this change to every later sample, until the host stops."""
     def begin(here):
         here.drive.misbehave = lambda drive, sample: sample if "quick_stop" in drive.calls else change(drive, sample)
     return begin
@@ -148,7 +148,7 @@ def test_row_6_a_stop_that_is_not_confirmed(stage):
 
 
 class Slow(FakeDrive):
-    """Begins so many cycles late, from when it is told to."""
+    """Drive whose cycles are late, once it is switched on."""
 
     late_every = 0
     overruns = 0
@@ -195,7 +195,7 @@ def test_row_10_a_log_that_can_not_be_written(stage):
 
 @pytest.mark.heavy(but_first=2)
 @in_motion
-def test_rows_12_13_15_the_bus_is_gone(stage):
+def test_rows_12_13_15_the_bus_is_lost(stage):
     def begin(here):
         def gone(drive, sample):
             raise CommunicationLost("the bus did not accept a frame")
@@ -206,7 +206,7 @@ def test_rows_12_13_15_the_bus_is_gone(stage):
 
 
 class Lossy(FakeDrive):
-    """Loses every so many frames."""
+    """Drive that loses one frame in a given number."""
 
     every = 0
 
@@ -230,7 +230,7 @@ def test_row_17_lost_frames(stage, every, outcome):
 
 
 class Doubled(FakeDrive):
-    """Feedback that comes twice, or after its cycle."""
+    """Drive whose feedback is duplicated, or arrives after its cycle."""
 
     late = 0
 
@@ -260,7 +260,7 @@ def test_row_19_no_feedback_any_more(stage):
 
 
 def test_row_19_the_same_feedback_again_and_again():
-    """Fresh frames with old values, in the excitation, where the setpoint moves."""
+    """The frames are fresh and contain old values, during the excitation, while the setpoint changes."""
     kept = []
 
     def frozen(drive, sample):
@@ -282,7 +282,7 @@ def test_row_19_the_same_feedback_again_and_again():
     ids=["20", "21", "22", "23"],
 )
 def test_rows_20_to_23_what_the_driver_raises(stage, error, code):
-    """Once, as the contract says; the stop goes on exchanging."""
+    """The drive raises once, as in the contract, and the stop continues to exchange."""
     told = []
 
     def begin(here):
@@ -303,17 +303,17 @@ def test_rows_20_to_23_what_the_driver_raises(stage, error, code):
 @pytest.mark.parametrize("state", [PowerState.OFF, PowerState.READY, PowerState.QUICK_STOP, PowerState.FAULT])
 def test_rows_31_33_a_drive_that_leaves_its_state(stage, state):
     def begin(here):
-        here.drive.state = here.drive.wish = state         # without torque it runs out, longer than every lag
+        here.drive.state = here.drive.wish = state         # without torque it coasts for longer than every lag
 
     ended = run(stage, begin)
     assert isinstance(ended.result.cause, DriveFault)
     assert state.value in str(ended.result.cause)
     assert ended.result.cause.where.startswith("statusword")
     assert ended.here.drive.speed == pytest.approx(0.0, abs=0.05)
-    # Before J is known, a slow shaft stops within the lags of its report: a lost signal would look the same.
+    # Before J is known, a slow shaft stops within the lags of its report. A lost signal would look the same.
     hidden = stage == "speed" and state in (PowerState.OFF, PowerState.READY)
     assert ended.result.stop.confirmed is not hidden
-    assert ended.code is ExitCode.DRIVE_FAULT              # of the cause; a stop without confirmation makes it 8
+    assert ended.code is ExitCode.DRIVE_FAULT              # of the cause; or 8 for an unconfirmed stop
 
 
 def test_row_31_a_drive_that_is_never_enabled():
@@ -324,7 +324,7 @@ def test_row_31_a_drive_that_is_never_enabled():
     assert here.drive.speed == 0.0
 
 
-def test_row_32_a_mode_that_is_not_taken_over():
+def test_row_32_a_mode_that_is_not_confirmed():
     def stays(drive, sample):
         return sample._replace(mode=Mode.SPEED)
 
@@ -345,9 +345,9 @@ def test_row_34_the_load_is_lost(stage):
         here.drive.coulomb, here.drive.viscous, here.drive.inertia = 0.0, 0.0, 5.0
 
     ended = run(stage, begin)
-    # While it only holds a steady speed the host's slow control copes for as long as stage 4 may take.
+    # At a steady speed, the slow control of the host compensates the loss for as long as stage 4 may take.
     ended.assert_stopped(LimitHit, ExitCode.LIMIT, soon=stage != "hold")
-    # Two cycles at the torque limit: a drive's own speed limit, set in preflight, is there for this.
+    # Two cycles at the torque limit. The speed limit of the drive itself, set in preflight, covers this.
     assert max(ended.speeds) <= 10.0 + 2.0 * PERIOD_S * 400.0 / 5.0
 
 
@@ -420,7 +420,7 @@ def test_row_37_a_setpoint_that_is_none_ends_the_run(stage):
 
 
 def test_the_first_cause_is_kept():
-    """What goes wrong while stopping is reported beside it."""
+    """Failures during the stop are reported as well."""
     def begin(here):
         here.stop_request.ask(signal.SIGINT)
         plain, left = here.drive.quick_stop, [2]

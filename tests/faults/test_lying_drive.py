@@ -1,7 +1,7 @@
-"""What each lie of `sim_bus.reports` makes of the five reports, against a twin of the drive that tells the truth.
+"""Effect of each lie of `sim_bus.reports` on the five reports, compared with a twin of the drive with true reports.
 
-Both drives have the same seed. A lie in a report alone leaves the shaft as it is; one in the sensor or in the power
-stage moves it, and then the shaft is compared with what the reports say of it.
+Both drives have the same seed. A lie in a report alone does not change the shaft. One in the sensor or in the power
+stage changes its motion; then the shaft is compared with its reports.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COUNTS_PER_RAD = 8192 / (2.0 * pi)
 
 
 class Drive:
-    """Enabled in a cyclic mode, with its objects."""
+    """Drive that is enabled in a cyclic mode, with its objects."""
 
     def __init__(self, noise: NoiseParams) -> None:
         self.inverter = Inverter(RigParams(reporting=FAITHFUL, noise=noise), np.random.default_rng(5))
@@ -52,7 +52,7 @@ class Drive:
 
 
 def pair(name: str, value: str = "", *, before_s: float = 3.0, after_s: float = 1.0) -> tuple[Drive, Drive]:
-    """A drive with this lie for ``after_s``, in the middle of speeding up, and its twin."""
+    """Return a drive with this lie for ``after_s`` during acceleration, and its twin."""
     drives = Drive(NoiseParams()), Drive(NoiseParams())
     for one in drives:
         one.run(before_s)
@@ -160,7 +160,7 @@ def test_a_wrong_sensor_misleads_the_drive_and_counts_wrong(name, value, share):
     turned = drive.inverter.state.angle_rad - angle
     counted = (drive.told()["position"] - told) / COUNTS_PER_RAD
     assert counted == pytest.approx(share * turned, rel=0.03, abs=0.003)
-    assert drive.inverter.speed_rad_s - twin.inverter.speed_rad_s != 0.0         # the shaft goes elsewhere
+    assert drive.inverter.speed_rad_s - twin.inverter.speed_rad_s != 0.0         # the shaft moves differently
     assert drive.told()["torque"] == pytest.approx(drive.inverter.torque_nm, abs=1.0)
 
 
@@ -223,7 +223,7 @@ def test_a_lie_ends():
     (9, lambda application: application.write_controlword(0x00)),
     (9, lambda application: application.write_controlword(0x010F)),
 ])
-def test_the_drive_knows_when_it_is_told_to_come_to_rest(mode, then):
+def test_the_drive_detects_a_requested_stop(mode, then):
     drive, told = Drive(NoiseParams()), []
     drive.application.on_stop = lambda: told.append(drive.inverter.speed_rad_s)
     drive.run(2.0)
@@ -234,7 +234,7 @@ def test_the_drive_knows_when_it_is_told_to_come_to_rest(mode, then):
     assert len(told) == 1 and told[0] > 1.0
 
 
-def test_nobody_told_a_drive_at_rest_to_stop():
+def test_a_drive_at_standstill_is_not_in_a_requested_stop():
     drive, told = Drive(NoiseParams()), []
     drive.application.on_stop = lambda: told.append(0)
     drive.run(1.0, speed=0.0)

@@ -1,6 +1,6 @@
-"""A seeded fifty of the runs with a lying drive (`sim_bus.lying_runs`), each against the true shaft.
+"""Fifty seeded runs with false reports of the drive (`sim_bus.lying_runs`), each compared with the true shaft.
 
-Many more: `python benchmarks/lying_reports.py --all`.
+For many more runs see `python benchmarks/lying_reports.py --all`.
 """
 
 import pytest
@@ -21,18 +21,18 @@ def closed(log):
 
 
 ONCE_BELIEVED = (746, 856, 2130, 2147, 2264, 3730, 4889, 4980, 5087, 5089)
-"""746: the sensor is lost in the stop above a string; a stiffer release calmed the torque: disabled at 2.4 rad/s.
-856: a sign that changes above a string; believed again while the shaft ran out, the speed control drove it to 42 rad/s.
+"""746: the sensor is lost in the stop above a string. A stiffer release reduced the torque; disabled at 2.4 rad/s.
+856: a sign changes above a string. It was accepted again while the shaft coasted; speed control drove it to 42 rad/s.
 2130, 2264: a sensor whose scale halves or doubles within stage 2 above a string: J doubled or halved, and valid.
 2147: a sensor whose scale halves in speed mode at low speed: 80 s at twice the speed, 18.8 of 10 rad/s.
-3730: a coarse speed report beside a position that the stop read too seldom to use: disabled at 0.33 rad/s.
+3730: a coarse speed report with a position that the stop read too rarely: disabled at 0.33 rad/s.
 4889: a torque constant that halves within stage 2 doubled J above a string of known size, and valid.
-4980: a torque constant that loses a tenth above a string: J was as wrong, and no text said that this stays hidden.
+4980: a torque constant that loses a tenth above a string: J had the same error, and no text stated that it is hidden.
 5087: a torque constant that doubles after the run-up of stage 2: J halved, valid_wide, and all later ramps agreed.
-5089: a torque constant that doubles within stage 2: J halved, valid_wide, although the pipe's impedance halved, too."""
+5089: a torque constant that doubles within stage 2: J halved, valid_wide, although the pipe's impedance halved too."""
 
 
-@pytest.mark.heavy(each_share=True)     # fifty lies at each commit: no other fault is as bad as a lie that is believed
+@pytest.mark.heavy(each_share=True)     # fifty at each commit: a false report is the most serious fault
 @pytest.mark.parametrize(
     "combination", [*sample(COUNT, SEED), *(product()[number] for number in ONCE_BELIEVED)], ids=str)
 def test_no_lie_is_believed(combination, tmp_path):

@@ -1,4 +1,4 @@
-"""Row 72: a serial line on which every fifth reply is damaged, from some time in motion on, judged on the shaft."""
+"""Row 72: a serial line on which one in five replies is damaged, from a time in motion on; checks of the true shaft."""
 
 import random
 
@@ -10,7 +10,7 @@ from tests.faults.rehearsal import at, run
 
 
 class Noise:
-    """The drive acts, its reply comes, and is damaged: a share of them, seeded."""
+    """Line that damages a seeded share of the replies. The drive executes the requests."""
 
     def __init__(self, monkeypatch):
         self.share, self.damaged, self._random = 0.0, 0, random.Random(7)
@@ -29,7 +29,7 @@ class Noise:
 @pytest.mark.heavy
 @pytest.mark.parametrize("profile", ["generic/modbus", "siemens/g120"])
 def test_row_72_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_user, monkeypatch, tmp_path, seen):
-    """One request a cycle, and three of them at 19,200 baud."""
+    """The cases are one request per cycle, and three at 19,200 baud."""
     noise = Noise(monkeypatch)
 
     def begin(_):

@@ -1,4 +1,4 @@
-"""Rows 38 to 45 of the fault table on the whole path: a line that misbehaves, and a drive wired otherwise than said."""
+"""Rows 38 to 45 of the fault table on the whole path: line faults, and a drive that differs from its description."""
 
 from functools import partial
 
@@ -11,7 +11,7 @@ from tests.faults.rehearsal import at, run
 MODBUS = ("--drive", "modbus")
 WATCHDOG_S = 0.5
 NOTICED_S = WATCHDOG_S + 0.1
-"""By the host within half of that, by the drive's own watchdog within all of it, and five cycles."""
+"""Longest detection time: half of the watchdog time by the host, or all of it by the drive, plus five cycles."""
 
 
 READS = (0x03, 0x04)
@@ -19,7 +19,7 @@ READS = (0x03, 0x04)
 
 
 class Line:
-    """Between driver and simulated drive; ``becomes(serve, unit, pdu, now_s)`` → (reply or None, when complete)."""
+    """Line between driver and simulated drive; ``becomes(serve, unit, pdu, now_s)`` → (reply or None, end time)."""
 
     def __init__(self, monkeypatch):
         self.becomes, self.left, self.writes_only = None, 0, False
@@ -35,34 +35,34 @@ class Line:
         monkeypatch.setattr(embedded.EmbeddedModbusDrive, "serve", passing)
 
     def begin(self, becomes, requests):
-        """Change this many requests. A single one is a write of the cycle: a check of settings is read again."""
+        """Change this many requests. A single one is a write of the cycle, since a check of settings is repeated."""
         self.becomes, self.left, self.writes_only = becomes, requests, requests == 1
 
 
 def refusing(code):
-    """The drive answers with an exception and does nothing (Modbus application protocol V1.1b3, section 7)."""
+    """Reply with an exception; the drive does nothing (Modbus application protocol V1.1b3, section 7)."""
     return lambda serve, unit, pdu, now_s: (bytes((pdu[0] | 0x80, code)), now_s + 0.001)
 
 
 def silent(serve, unit, pdu, now_s):
-    """Neither request nor reply gets through."""
+    """Lose request and reply."""
     return None, now_s
 
 
 def late(serve, unit, pdu, now_s):
-    """The drive acts, and its reply comes when nobody waits any more."""
+    """Deliver the reply after the time-out of the host; the drive executes the request."""
     reply, complete_s = serve(unit, pdu, now_s)
     return reply, complete_s + 1.0
 
 
 def cut(serve, unit, pdu, now_s):
-    """The drive acts, and half of its reply is there."""
+    """Deliver half of the reply; the drive executes the request."""
     reply, complete_s = serve(unit, pdu, now_s)
     return reply[: len(reply) // 2], complete_s
 
 
 def foreign(serve, unit, pdu, now_s):
-    """The reply to somebody else's request."""
+    """Deliver the reply to a request of another master."""
     reply, complete_s = serve(unit, pdu, now_s)
     return bytes((reply[0] ^ 7,)) + reply[1:], complete_s
 
@@ -77,7 +77,7 @@ ENDS = [
     (38, "exception 2", refusing(2), 1, 6, ("exception 2", "address")),
     (38, "exception 3", refusing(3), 1, 6, ("exception 3", "value")),
     (38, "exception 4", refusing(4), 1, 6, ("exception 4", "panel")),
-    # It answers, and can't be stopped: the hard-wired emergency stop is asked for.
+    # It replies and cannot be stopped: the message asks for the hard-wired emergency stop.
     (38, "exception 2 for good", refusing(2), 10**9, 8, ("exception 2", "address")),
     (38, "busy for good", refusing(6), 10**9, 8, ("no ", "watchdog")),
     (39, "silence", silent, 10**9, 8, ("no ", "watchdog")),
@@ -91,7 +91,7 @@ IN_STAGES = [(*case, "speed") for case in ENDS] + [(*case, "acquire") for case i
 
 
 AT_ONCE = ("exception 1", "exception 2 for good", "silence", "every reply cut short")
-"""In the README's command; the others are CI's. tests/drivers/test_modbus_wrongs.py has each of them, without a run."""
+"""Cases of the README's command; CI runs the others. tests/drivers/test_modbus_wrongs.py has all, without a run."""
 
 
 @pytest.mark.heavy(but_first=1)
@@ -109,8 +109,8 @@ def test_it_ends_with_the_shaft_at_rest(
     ended = run(tmp_path, *MODBUS)
     ended.assert_ended(code, *words)
     standstill_s = ended.assert_stopped(acted[0], NOTICED_S)
-    assert ended.shaft.speed_at(acted[0]) > 0.3, "it was to happen in motion"
-    # What nobody can tell is said so: a drive that can't be asked is not known to be at rest.
+    assert ended.shaft.speed_at(acted[0]) > 0.3, "the fault did not occur in motion"
+    # The report states that standstill is not confirmed, since the drive does not reply.
     assert ("NOT confirmed" in ended.done.document["stop"]) is (requests > 1)
     seen(row, f"{name}: {ended.message}", standstill_s, ended.assert_log_whole(), ended.done.code)
 
@@ -134,7 +134,7 @@ def test_it_is_survived(row, name, becomes, requests, line, monkeypatch, tmp_pat
     acted = at(monkeypatch, "acquire", 5.0, lambda _: line.begin(becomes, requests))
     ended = run(tmp_path, *MODBUS)
     assert acted and line.left == 0
-    assert ended.done.code in (0, 9), ended.done.err       # three periods: how well they tell J is no matter here
+    assert ended.done.code in (0, 9), ended.done.err       # three periods: the uncertainty of J does not matter here
     assert [outcome for _, outcome in ended.done.outcomes] == ["ok"] * 5
     ended.shaft.assert_at_rest()
     seen(row, name, None, ended.assert_log_whole(), ended.done.code)

@@ -1,6 +1,6 @@
-"""`tdhil identify --drive modbus --simulate --fault …`, and `simulate modbus --fault …`: rehearsed end to end.
+"""End-to-end rehearsal of `tdhil identify --drive modbus --simulate --fault …`, and `simulate modbus --fault …`.
 
-What each row must look like is `test_modbus_rows`' concern, with faults made by the test; here the same is asked for on
+`test_modbus_rows` checks the reaction to each row with faults of the test itself. Here the same faults come from
 the command line.
 """
 
@@ -26,7 +26,7 @@ CASES = (
     Case(32, "mode-not-followed@torque", 6, ("torque mode", "--mode speed")),
     Case(33, "sto" + IN_MOTION, 6, ("STO",), "coasts"),
     Case(33, "internal-limit@torque+3s", 7, ("internal limit",), notice_s=4.5),
-    # without its load the shaft is light: once it is free, the random torque of the bearings moves it for a second
+    # Without load the shaft is light: once disabled, the random torque of the bearings moves it for a second.
     Case(34, "load-lost@torque+3s", 7, ("the speed changes faster than this shaft",), notice_s=2.0, free_rad_s=0.2),
     Case(35, "hot" + IN_MOTION, 7, ("too hot", "motor temperature: 150 °C", "limit of 110 °C"), notice_s=3.0),
     Case(35, "torque-scale" + IN_MOTION + "=5", 7, ("above the limit of 400 N·m",)),
@@ -58,8 +58,8 @@ def test_row(case, rehearse, tmp_path):
 
 
 @pytest.mark.heavy
-def test_replies_that_are_lost_now_and_then(rehearse):
-    """Seeded, in stepped time: the run goes on, and again the same way."""
+def test_replies_that_are_lost_occasionally(rehearse):
+    """With a seed and stepped time, the run continues, and a second run is identical."""
     first, second = (rehearse("--drive", "modbus", "--fault", "bad-crc@speed+15s=20%/2s") for _ in range(2))
     assert first.done.code in (0, 9), first.done.err
     assert {outcome for _, outcome in first.done.outcomes} <= {"ok", "degraded"}
@@ -90,7 +90,7 @@ def test_the_list_of_one_bus_is_shorter():
 @pytest.mark.heavy
 @pytest.mark.real_time
 def test_a_connection_that_is_reset_in_motion(tmp_path):
-    """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
+    """Row 43 with the drive in its own process, in real time. The trace is in plant time."""
     rig = rig_file(tmp_path, PATIENT_LIMITS)
     with (modbus_peer(tmp_path / "shaft.csv", "--fault", "reset@speed+2s") as drive,
           host(tmp_path, *drive.options, "--rate", 4, "--rig", rig, cwd=tmp_path) as running):
@@ -102,7 +102,7 @@ def test_a_connection_that_is_reset_in_motion(tmp_path):
 
         wait_for("the shaft to come to rest", resting)
         shaft = drive.shaft
-    assert done.code == 8, done.err           # it can't see the shaft come to rest
+    assert done.code == 8, done.err           # it cannot confirm standstill
     assert "connection" in done.document["error"]["message"] and "Traceback" not in done.err
     (at_s,) = shaft.events("fault: ")
     assert shaft.speed_at(at_s) > 0.1

@@ -1,4 +1,4 @@
-"""Rows 66 on: other clients of a Modbus drive that read, command, or change its settings; judged on the shaft."""
+"""Rows from 66 on: other clients of a Modbus drive that read, command or change settings; checks of the true shaft."""
 
 import math
 import struct
@@ -18,7 +18,7 @@ TURNING_RAD_S = 0.3
 
 
 def fed_by(folder, what):
-    """generic/modbus, but for what feeds its watchdog, as a file."""
+    """Return a file with the profile generic/modbus and another source that feeds the watchdog."""
     path = folder / "fed.yaml"
     path.write_text(profile_path("generic/modbus").read_text().replace("fed_by: writes", f"fed_by: {what}"))
     return path
@@ -30,7 +30,7 @@ def fed_by(folder, what):
     ("writes_of_this_connection", False),
 ])
 def test_a_host_dies_while_another_client_reads(tmp_path, what, runs_on):
-    """On the simulated drive itself: what the operator is asked about."""
+    """On the simulated drive itself, the shaft turns on only if any request feeds the watchdog."""
     trace = tmp_path / "shaft.csv"
     with EmbeddedModbusDrive(RigParams(), load_modbus_profile(str(fed_by(tmp_path, what))), trace=trace) as drive:
         now_s = 0.0
@@ -54,13 +54,13 @@ def test_a_host_dies_while_another_client_reads(tmp_path, what, runs_on):
 
 @pytest.mark.heavy
 def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen):
-    """A real drive in a process of its own: nothing moves, and the way out is named."""
+    """With a real drive in its own process there is no motion, and the message names the remedy."""
     profile = fed_by(tmp_path, "any_request")
     rig = rig_file(tmp_path, "name: bench 3\n", limits_text(watchdog_s=2.0))
     with modbus_peer(tmp_path / "shaft.csv", "--profile", profile, program=REAL) as drive:
         line = (*drive.options, "--profile", profile, "--rig", rig, "--rate", 4)
         refused = identify(tmp_path, *line, "--yes")
-        taken = identify(tmp_path, *line, BY_NAME)         # and nobody at the terminal confirms
+        taken = identify(tmp_path, *line, BY_NAME)         # and no operator confirms at the terminal
     assert refused.code == taken.code == 4
     message = refused.document["error"]["message"]
     assert "any request" in message and "will not stop by itself" in message and BY_NAME in message
@@ -76,7 +76,7 @@ def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen)
 
 
 class Other:
-    """Asks the drive over a connection of its own every ``every_s`` of plant time, from `begin` on."""
+    """Other client that sends requests over its own connection every ``every_s`` of plant time, from `begin` on."""
 
     def __init__(self, monkeypatch):
         self.pdus, self.every_s, self.next_s, self.until_s = (), 0.0, math.inf, math.inf
@@ -102,7 +102,7 @@ def other(no_bus_of_the_user, monkeypatch):
 
 
 def command(control, speed_rad_s, torque_permille=0, mode=0):
-    """Control word, both setpoints and the mode of generic/modbus, in one request."""
+    """Write control word, both setpoints and the mode of generic/modbus in one request."""
     rpm = round(speed_rad_s / (2.0 * math.pi / 60.0) / 0.01)
     return struct.pack(">BHHBHihH", 16, 0, 5, 10, control, rpm, torque_permille, mode)
 
@@ -113,7 +113,7 @@ def command(control, speed_rad_s, torque_permille=0, mode=0):
     (20.0, command(15, 0.0, 300, 1), "hold"), (10.0, struct.pack(">BHHBi", 16, 1, 2, 4, 4775), "speed"),
 ], ids=["5 Hz", "50 Hz", "100 Hz in acquire", "torque in hold", "its setpoint alone"])
 def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_path, seen):
-    """The stop stands against it, the shaft comes to rest, and who did it is told."""
+    """The stop prevails, the shaft comes to standstill, and the message names the other master."""
     acted = at(monkeypatch, stage, 5.0, lambda sample: other.begin(sample.time_s, 1.0 / hz, pdu))
     ended = run(tmp_path, "--drive", "modbus")
     assert ended.done.code in (5, 8), ended.done.err
@@ -124,7 +124,7 @@ def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
     after = shaft.time_s >= acted[0]
     assert abs(shaft.speed_rad_s[after]).max() < 7.0
     quiet = shaft.time_s >= shaft.time_s[-1] - 1.0
-    assert abs(shaft.speed_rad_s[quiet]).max() < 0.2, "the other master turned the shaft on"
+    assert abs(shaft.speed_rad_s[quiet]).max() < 0.2, "the other master kept the shaft turning"
     seen(67, f"{hz:g} Hz in {stage}: {ended.message}", ended.standstill_s(acted[0]) if ended.done.code == 5 else None,
          ended.assert_log_whole(), ended.done.code)
 
@@ -136,7 +136,7 @@ def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
     (38, 4000, ("register 38", "was 0.4 of rated torque, and is 4 of rated torque")),
 ], ids=["watchdog off", "reaction", "torque limit"])
 def test_row_68_somebody_changes_a_setting_in_motion(address, value, words, other, monkeypatch, tmp_path, seen):
-    """Once, as a commissioning tool does: a host that died later would find no watchdog."""
+    """It writes once, like a commissioning tool. If the host died later, no watchdog would stop the shaft."""
     pdu = struct.pack(">BHH", 6, address, value)
     acted = at(monkeypatch, "speed", 5.0, lambda sample: other.begin(sample.time_s, 0.05, pdu, lasts_s=0.06))
     ended = run(tmp_path, "--drive", "modbus")

@@ -1,7 +1,7 @@
-"""Rows 4, 41 and 43 over TCP in real time: the host is killed, or what carries its requests misbehaves in motion.
+"""Rows 4, 41 and 43 over TCP in real time: the host is killed, or the connection fails in motion.
 
-The drive is a process of its own, and so is the host; between them, where the network is at fault, a relay by hand.
-Nothing is measured in wall time: the shaft's trace is in the plant's own.
+Drive and host are separate processes. For faults of the network, a relay is between them.
+The tests do not measure wall time: the trace of the shaft is in plant time.
 """
 
 import contextlib
@@ -18,15 +18,15 @@ from tests.rigs import PATIENT_LIMITS, PATIENT_S, rig_file
 
 pytestmark = pytest.mark.real_time
 
-TURNING_RAD_S = 1.0         # the sign probe stays below it, and ends at rest by itself
+TURNING_RAD_S = 1.0         # the sign probe stays below this speed and ends at standstill
 LATE_S = 0.3
-"""A machine that is busy with other tests looks at its watchdog late."""
+"""Allowance for a computer that is busy with other tests and checks its watchdog late."""
 RATE_HZ = 4.0
-"""Slow: in real time a busy machine must not be taken for a fault. Three cycles without feedback end a run."""
+"""Slow rate, so that a busy computer causes no fault in real time. Three cycles without feedback end a run."""
 
 
 class Relay(TcpPeer):
-    """Passes everything on, until ``fault`` says otherwise: reset, half-open, or foreign (once)."""
+    """Relay that forwards all data, until ``fault`` is set: reset, half-open, or foreign (once)."""
 
     def __init__(self, port):
         super().__init__(None)
@@ -55,7 +55,7 @@ class Relay(TcpPeer):
 
 
 class Bench:
-    """A simulated drive, and the command line that drives it."""
+    """Simulated drive, and the command line that controls it."""
 
     def __init__(self, folder, stack):
         self.folder, self.trace, self.stack = folder, folder / "shaft.csv", stack
@@ -81,9 +81,9 @@ class Bench:
         return float(self.shaft.time_s[-1])
 
     def silent_from(self):
-        """Plant time by which whatever the host had sent has been served: it is dead, or hears and is heard no more.
+        """Return the plant time by which all requests of the host are served. The host is dead or disconnected.
 
-        Two more flushes of the trace: between them, the drive has looked at its line.
+        The drive has polled its line between two more flushes of the trace.
         """
         for _ in range(2):
             seen_s = tail_time(self.trace)
@@ -91,7 +91,7 @@ class Bench:
         return tail_time(self.trace)
 
     def wait_at_rest(self, since_s):
-        """Within the watchdog's time and the ramp of ``since_s``, when nothing more had come, at the latest."""
+        """Wait for standstill within watchdog time and ramp after ``since_s``, the time of the last request."""
         def resting():
             shaft = self.shaft
             return shaft.time_s[-1] > max(since_s, shaft.at_rest_from()) + 1.0
@@ -136,7 +136,7 @@ def test_a_connection_that_dies(bench, fault, seen):
         connections = relay.connections
     standstill_s = bench.wait_at_rest(at_s)
     assert done.code == 8, done.err
-    assert connections == 1, "connected anew while the drive was enabled"
+    assert connections == 1, "connected again while the drive was enabled"
     error = done.document["error"]
     assert error["kind"] in ("LinkLost", "CommunicationLost", "NoReply")
     assert "127.0.0.1" in error["message"] or "no feedback" in error["message"]

@@ -1,4 +1,4 @@
-"""A rehearsed fault ends with a verdict: the required reaction, what was seen, pass or fail; and with its exit code."""
+"""Verdict of a rehearsed fault: required reaction, observed reaction, pass or fail, and exit code."""
 
 import re
 
@@ -58,7 +58,7 @@ def test_the_verdict_is_the_row_s(fault, found, verdict, code):
     assert ("TDH-1200" in rehearsal.lines[0]) is (verdict == "fail")
 
 
-def test_a_fault_that_never_came_is_no_pass_beside_one_that_did():
+def test_a_fault_that_did_not_occur_is_no_pass_beside_one_that_did():
     rehearsal = judged("emcy@speed+1s", "sto@acquire", cause=DriveFault("7305h"), never=["sto@acquire"])
     assert [one.verdict for one in rehearsal.faults] == ["pass", "inconclusive"]
     assert rehearsal.verdict == "inconclusive" and "Not triggered: sto@acquire" in rehearsal.seen
@@ -71,7 +71,7 @@ def test_every_row_that_a_script_names_has_its_required_reaction(drive):
     assert all(ROWS[row].expected == REQUIRED[row].reaction for row in rows)
 
 
-def test_a_log_may_say_anything():
+def test_a_log_may_contain_any_text():
     assert rehearsal_of({"rehearsal": {"verdict": 3, "faults": [{"row": "x"}, 5]}})["faults"][0]["row"] == 0
     assert rehearsal_of({"rehearsal": 5}) is None and rehearsal_of({}) is None
 
@@ -87,7 +87,7 @@ def test_a_refusal_that_is_required_passes_in_document_and_on_the_terminal(rehea
 
 @pytest.mark.heavy
 def test_a_lie_that_no_signal_shows_fails_in_document_card_and_exit_code(rehearse):
-    """The power stage gives nine tenths of the torque that it reports: J is too large, and the tool cannot know."""
+    """The power stage gives nine tenths of the reported torque. J is too large, and no signal shows it."""
     run = rehearse("--fault", "torque-constant=0.8")
     document = run.done.document
     assert document["inertia_kg_m2"]["low_total"] > 104.0

@@ -1,6 +1,6 @@
-"""Rows 12 to 16: what the host's own adapter does, by a bus of the tests' own between driver and simulator.
+"""Rows 12 to 16: faults of the host's adapter, made by a test bus between driver and simulator.
 
-The simulated drive's watchdog must bring the shaft to rest once nothing reaches it any more.
+The watchdog of the simulated drive must stop the shaft once no frame reaches it.
 """
 
 import can
@@ -16,7 +16,7 @@ WATCHDOG_S = 0.6
 
 @pytest.fixture
 def adapter(rehearse, monkeypatch):
-    """The host's bus, as the simulator hands it out."""
+    """Return the bus that the simulator gives to the host."""
     made = []
     plain = InlineSimulator.station
 
@@ -29,7 +29,7 @@ def adapter(rehearse, monkeypatch):
 
 
 def run_with(rehearse, monkeypatch, after_s, act, *arguments):
-    """The simulator runs out by itself only where faults are scripted: one that never comes does it."""
+    """Run with a fault that never occurs: the simulator continues after the host only if a fault is scripted."""
     acted = at(monkeypatch, "speed", after_s, act)
     return rehearse("--fault", "bus-dead@9999s", *arguments), acted
 
@@ -54,7 +54,7 @@ def test_row_12_adapter_unplugged(rehearse, adapter, monkeypatch, seen):
 
 @pytest.mark.heavy
 def test_row_13_bus_off(rehearse, adapter, monkeypatch, seen):
-    """The adapter may come back by itself; nothing more is sent in this run all the same."""
+    """The adapter may recover, but the run transmits no more frames."""
     def act(sample):
         adapter().error_frame(BUS_OFF)
         adapter().sent.clear()
@@ -87,13 +87,13 @@ def test_row_15_transmit_queue_full(rehearse, adapter, monkeypatch, seen):
         bus.tried.clear()
 
     run, acted = run_with(rehearse, monkeypatch, 15.0, act)
-    assert len(adapter().tried) == 1                  # and never again
+    assert len(adapter().tried) == 1                  # and stays full
     assert_left_to_the_watchdog(run, acted, seen, 15, "No buffer space", "watchdog")
 
 
 @pytest.mark.heavy
 def test_row_16_a_bus_that_comes_back_with_queued_setpoints(rehearse, adapter, monkeypatch, seen):
-    """The queue took some frames before it was full. They go out when the drive has begun to stop by itself."""
+    """The queue takes some frames before it is full. They are transmitted after the drive has begun its own stop."""
     late = []
 
     def full(message):
@@ -107,7 +107,7 @@ def test_row_16_a_bus_that_comes_back_with_queued_setpoints(rehearse, adapter, m
         tried = len(bus.tried)
 
         def shut_down(plain=bus.shutdown):
-            # The run is over, the drive has stopped by itself; now the kernel's queue goes out after all.
+            # The run is over and the drive has stopped the shaft. Now the queue of the kernel is transmitted.
             assert len(bus.tried) - tried <= 12
             late.extend(bus.deliver())
             plain()
@@ -121,6 +121,6 @@ def test_row_16_a_bus_that_comes_back_with_queued_setpoints(rehearse, adapter, m
     assert lost_s - acted[0] <= WATCHDOG_S
     standstill_s = run.assert_stopped(acted[0], WATCHDOG_S)
     enabled = [t for t, state in zip(run.shaft.time_s, run.shaft.state, strict=True) if state == "operation enabled"]
-    assert max(enabled) <= lost_s                    # stale words of an enabled drive enabled nothing
+    assert max(enabled) <= lost_s                    # stale controlwords did not enable the drive
     seen(16, f"{len(late)} queued frames reached the drive late: it stays in its own quick stop", standstill_s,
          run.assert_log_whole(), run.done.code)

@@ -1,4 +1,4 @@
-"""Rows of the fault table that the host's side causes: signals, mistakes, disks, files, setpoints."""
+"""Rows of the fault table with causes in the host: signals, errors, disks, files, setpoints."""
 
 import os
 import signal
@@ -56,7 +56,7 @@ def test_row_2_a_second_signal_during_the_stop(rehearse, monkeypatch, seen):
 
     monkeypatch.setattr(LiveDisplay, "cycle", cycle)
     run = rehearse()
-    assert min(again) > 1.0                          # while it still turned
+    assert min(again) > 1.0                          # while the shaft still turned
     stopped_by_host(run, acted[0], seen, 2, 130, "interrupted by Ctrl-C")
 
 
@@ -84,13 +84,13 @@ def test_row_5_a_mistake_of_ours(where, rehearse, monkeypatch, seen):
 
 @pytest.mark.heavy
 def test_row_6_a_stop_that_is_not_confirmed(rehearse, monkeypatch, seen):
-    """The drive ignores the quick stop. Its setpoint of zero speed is followed, and its watchdog acts in the end."""
+    """The drive ignores the quick stop. It follows the setpoint of zero speed, and its watchdog acts at the end."""
     acted = at(monkeypatch, "speed", 16.0, kill(signal.SIGINT))
     run = rehearse("--fault", "stuck-state@speed+15s")
     run.assert_ended(8)
     assert "NOT confirmed" in run.done.document["stop"]
     assert "Use the hard-wired emergency stop now" in run.done.err
-    assert "interrupted" in run.message              # the first cause stays the cause
+    assert "interrupted" in run.message              # the first cause is kept
     assert run.shaft.state[-1] == "quick stop active"
     seen(6, "use the hard-wired emergency stop now; the setpoint of zero stops the shaft nevertheless, and the drive is"
          " not disabled", run.assert_stopped(acted[0], NOTICED_AT_ONCE_S), run.assert_log_whole(), 8)
@@ -166,7 +166,7 @@ def test_row_37_a_setpoint_that_is_none(field, value, rehearse, monkeypatch, see
 
 @pytest.mark.heavy
 def test_row_49_an_aborted_run_begins_anew(rehearse, seen):
-    """Resuming is not offered: the next run starts with a new preflight, from standstill."""
+    """A run cannot be resumed. The next run starts with a new preflight, from standstill."""
     rehearse("--fault", "emcy@speed+3s").assert_ended(6)
     run = rehearse("--fault", "emcy@speed+3s")
     assert [name for name, _ in run.done.outcomes] == ["setup", "speed"]

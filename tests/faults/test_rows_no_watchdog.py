@@ -1,6 +1,6 @@
-"""Row 50: a watchdog that is not armed in the drive is refused, and taken by name; both halves, on both buses.
+"""Row 50: a drive without an armed watchdog is refused, or accepted by override; both cases on both buses.
 
-By name: the run is as safe as ever in all that the host can do, and nobody is told that the drive would do the rest.
+With the override, all functions of the host are unchanged. No message promises a reaction of the drive.
 """
 
 import pytest
@@ -26,7 +26,7 @@ def unarmed(rehearse, bus):
 
 
 def assert_accepted(run):
-    """In the log: the row of the preflight table, an event, and the configuration that the result is made from."""
+    """Assert the entries of the log: row of the preflight table, event, and configuration of the result."""
     log = read_run(run.log)
     told = {kind: [event.text for event in log.events if event.kind == kind] for kind in ("preflight", "watchdog")}
     assert [text for text in told["preflight"] if text.startswith("no watchdog: ") and BY_NAME in text]
@@ -42,7 +42,7 @@ def test_no_other_switch_takes_it(unarmed, bus, seen):
     run.assert_nothing_moved()
     assert BY_NAME in run.message
     log = run.assert_log_whole()
-    if bus == "modbus":                # the other is told by the scripted row
+    if bus == "modbus":                # the scripted row covers the other bus
         seen(50, f"the same on Modbus: {run.message}", None, log, run.done.code)
 
 
@@ -61,13 +61,13 @@ def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
 
 @pytest.mark.heavy
 def test_taken_by_name_and_the_line_is_gone(unarmed, bus, seen):
-    """What was accepted: nothing stops the shaft. The message must not promise it; the hard-wired stop is left."""
+    """The operator accepted this: nothing stops the shaft. The message names only the hard-wired stop."""
     cause = "bus-dead@speed+15s" if bus == "canopen" else "no-reply@speed+15s"
     run = unarmed(BY_NAME, "--fault", cause)
     run.assert_ended(8, "no watchdog is armed", "hard-wired emergency stop")
     assert "watchdog stops the shaft" not in run.message
     assert "NOT confirmed" in run.done.document["stop"]
-    assert abs(run.shaft.speed_rad_s[-1]) > 1.0, "the simulated drive was to have no watchdog"
+    assert abs(run.shaft.speed_rad_s[-1]) > 1.0, "the simulated drive has an active watchdog"
     detail = read_run(run.log).stages[-1].detail
     assert "watchdog stops the shaft" not in detail
     seen(50, f"{bus}, {BY_NAME}, `{cause}`: {run.message}", None, run.assert_log_whole(), run.done.code)
@@ -90,7 +90,7 @@ def test_never_with_a_string(unarmed, tmp_path):
 
 @pytest.mark.heavy
 def test_the_result_says_so_live_and_replayed(rehearse):
-    """On one bus, by the shortest way: the rest of it is the same."""
+    """The shortest run on one bus is sufficient: all other parts are the same."""
     run = rehearse(*NOT_ARMED, BY_NAME, "--periods", 3, "--mode", "speed")
     assert run.done.code in (0, 9), run.done.err
     assert_accepted(run)

@@ -1,7 +1,7 @@
-"""Rows 4 and 7: a host that is killed or frozen, in a process of its own; the drive's watchdog alone stops the shaft.
+"""Rows 4 and 7: a killed or frozen host in its own process. Only the watchdog of the drive stops the shaft.
 
-Stepped time, but a silent host makes the simulator run on in its own. `tests/path/test_stops.py` does the same in more
-stages, and `benchmarks/kill_at_random.py` at fifty random moments.
+Time is stepped, but with a silent host the simulator continues in its own time. `tests/path/test_stops.py` tests more
+stages, and `benchmarks/kill_at_random.py` fifty random times.
 """
 
 import signal
@@ -26,7 +26,7 @@ SOURCES = ("drivers", "tdhil")
 
 @pytest.fixture
 def turning(no_bus_of_the_user, tmp_path, request):
-    """Peer and host, in stage 2 and past its ramp. A host that dies is noticed at once, a frozen one by its silence."""
+    """Start peer and host, up to stage 2 after its ramp. The end of a host is found at once, a freeze by silence."""
     program = PLAIN if "frozen" in request.node.name else PATIENT
     with peer(tmp_path, "--stepped", "--seed", 1, program=program) as drive, host(
         tmp_path, *drive.options, "--stepped", "--rate", 25, "--periods", 40
@@ -76,7 +76,7 @@ def test_row_7_frozen(turning, seen):
 
 
 def test_row_7_nothing_is_sent_by_kernel_or_thread():
-    """What lives in the kernel or in another thread would feed the watchdog with a dead host's setpoints."""
+    """Cyclic transmission by the kernel or another thread would feed the watchdog with setpoints of a dead host."""
     root = Path(__file__).parents[2]
     for path in (path for source in SOURCES for path in (root / source).rglob("*.py")):
         code = path.read_text(encoding="utf-8")
@@ -87,7 +87,7 @@ def test_row_7_nothing_is_sent_by_kernel_or_thread():
 
 @pytest.mark.heavy
 def test_a_host_that_dies_with_a_torque_offset_at_work(no_bus_of_the_user, tmp_path):
-    """What stands in 60B2h stays, and the drive's own speed loop brings the shaft to rest against it."""
+    """The value in 60B2h stays, and the speed loop of the drive stops the shaft against it."""
     with peer(tmp_path, "--stepped", "--seed", 1) as drive, host(
         tmp_path, *drive.options, "--stepped", "--rate", 25, "--impedance", "offset", "--periods", 10
     ) as running:
@@ -101,7 +101,7 @@ def test_a_host_that_dies_with_a_torque_offset_at_work(no_bus_of_the_user, tmp_p
 
 @pytest.mark.heavy
 def test_a_rehearsal_over_a_wire(no_bus_of_the_user, tmp_path):
-    """`tdhil simulate canopen --fault …` in a process of its own: it learns of the stages from the host."""
+    """`tdhil simulate canopen --fault …` is a separate process, and receives the stages from the host."""
     with peer(tmp_path, "--stepped", "--seed", 1, "--fault", "emcy@speed+15s=4310h") as drive, host(
         tmp_path, *drive.options, "--stepped", "--rate", 25
     ) as running:

@@ -1,4 +1,4 @@
-"""Rows of the fault table that a drive or a bus causes: scripted in the simulated drive, seen on the whole path."""
+"""Rows of the fault table with causes in drive or bus: scripted in the simulated drive, on the whole path."""
 
 from itertools import product
 
@@ -64,8 +64,10 @@ CASES = (
 
 
 AT_ONCE = ("sto" + IN_MOTION, "speed-lost" + IN_MOTION, "feedback-zero" + IN_MOTION, "encoder-inverted")
-"""Faults in motion that the README's command tries; the others are CI's. `test_lying_drive` has their contradictions,
-without a bus."""
+"""Faults in motion of the README's command; CI runs the others.
+
+`test_lying_drive` has their contradictions without a bus.
+"""
 
 
 def at_once(case):
@@ -110,7 +112,7 @@ LOSSES = (
 @pytest.mark.heavy
 @pytest.mark.parametrize(("row", "fault", "said"), LOSSES, ids=[fault for _, fault, _ in LOSSES])
 def test_row_with_a_run_that_goes_on(row, fault, said, rehearse, seen):
-    """M: the stage is marked, and J's interval still holds the truth where one is given."""
+    """Reaction M: the stage is marked, and the interval of J, if any, contains the true value."""
     run = rehearse("--fault", fault)
     document = run.done.document
     assert run.done.code in (0, 9), run.done.err
@@ -128,7 +130,7 @@ def test_row_with_a_run_that_goes_on(row, fault, said, rehearse, seen):
 
 @pytest.mark.heavy
 def test_a_fault_that_passes(rehearse):
-    """A duration: the bus is gone for a shorter time than anybody minds, and the run goes on."""
+    """The bus is lost for less than the tolerated time, and the run continues."""
     run = rehearse("--fault", "feedback-lost@speed+15s/100ms", "--max-time", 40)
     assert run.shaft.events("fault over: ")[0] - run.fault_s == pytest.approx(0.1, abs=0.021)
     assert {stage["outcome"] for stage in run.done.document["stages"]} <= {"ok", "degraded"}

@@ -1,7 +1,7 @@
-"""Rows of the fault table that another node, master, tool or panel causes on CANopen, judged on the true shaft.
+"""Rows of the fault table with causes in another node, master, tool or panel on CANopen; checks of the true shaft.
 
-A host that is killed leaves the shaft to the drive's watchdog: what these show is that the watchdog is never left in
-somebody else's hands. A run is refused, takes another number, or has come to rest before anybody could kill it.
+If the host is killed, the watchdog of the drive stops the shaft. These tests show that no other node takes over the
+watchdog. A run is refused, uses another node number, or ends at standstill before a kill is possible.
 """
 
 import pytest
@@ -64,7 +64,7 @@ def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
 
 @pytest.mark.heavy
 def test_a_quick_stop_that_is_undone_again_and_again_is_left_to_the_watchdog(rehearse, seen):
-    """The host's sign of life ends while it still looks on, and the drive's own reaction brakes the shaft."""
+    """The host stops its sign of life and continues to read. The reaction of the drive itself brakes the shaft."""
     run = rehearse("--fault", f"foreign-setpoints{IN_MOTION}=again")
     events = [event for event in read_run(run.log).events if event.kind in ("bus", "stop")]
     assert any("in spite of the quick stop" in event.text for event in events)

@@ -1,8 +1,8 @@
-"""A profile whose unit of speed is wrong, and nothing in the drive that contradicts it: judged on the true shaft.
+"""Profile with a wrong unit of speed that no object of the drive contradicts; checks of the true shaft.
 
-The host's profile says 0.01 rpm where a count is 0.1 rpm, and no highest speed is written to the drive: the shaft turns
-ten times as fast as it is asked to and says so of itself ten times too small. The whole path, stage 1 to the stop,
-through frames, in stepped time; what the shaft does is the simulator's own word.
+The profile states 0.01 rpm per count, but the drive uses 0.1 rpm, and no maximum speed is written. The shaft turns
+ten times as fast as commanded, and the reported speed is ten times too small. The tests use the whole path from
+stage 1 to the stop, through frames, in stepped time. The simulator gives the true motion.
 """
 
 import math
@@ -28,15 +28,15 @@ from tests.rigs import LIMITS
 from tests.runner.fake_drive import FakeDisplay, FakeLog
 
 RATE_HZ = 100.0
-"""Cycles per second on CANopen. What these tests judge takes seconds."""
+"""Cycles per second on CANopen, which is sufficient since the checked motions take seconds."""
 
 
 class Enough(Exception):
-    """The unit of speed has been settled: all that was to be seen has been seen."""
+    """End of a test: the check of the unit of speed is complete."""
 
 
 class Log(FakeLog):
-    """Ends the run once the unit of speed has been settled, or, ``on`` through, when the stage is over."""
+    """Log that ends the run once the unit of speed is checked, or with ``on`` at the end of the stage."""
 
     on = False
 
@@ -47,7 +47,7 @@ class Log(FakeLog):
 
 
 class Unmarked:
-    """A drive that is taken for a real one."""
+    """Simulated drive without the marker object, so that tdhil treats it as a real one."""
 
     def __init__(self, drive):
         self._drive = drive
@@ -67,7 +67,7 @@ class Unmarked:
 
 
 class Waking(Unmarked):
-    """Stands for a host that was frozen: an angle far ahead, read of a drive that has stopped by itself meanwhile."""
+    """Host that was frozen: it reads a distant angle from a drive that has stopped in the meantime."""
 
     def __init__(self, drive, reading):
         super().__init__(drive)
@@ -86,7 +86,7 @@ class Waking(Unmarked):
 
 
 class Rig:
-    """One bus: what the drive is, what the host takes it for, and how the true shaft turns."""
+    """One bus: the drive, the profile of the host, and the motion of the true shaft."""
 
     def __init__(self, drive, true_speed, close, node=None):
         self.drive, self.true_speed, self.close, self.node = drive, true_speed, close, node
@@ -113,7 +113,7 @@ class Rig:
         return self.outcome
 
     def says(self, answer):
-        """A `ConfirmSpeed` of an operator who looks for five seconds."""
+        """Return a `ConfirmSpeed` of an operator who observes the shaft for five seconds."""
 
         def confirm(speed_rad_s, why, idle):
             for _ in range(round(5.0 / self.drive.period_s)):
@@ -136,7 +136,7 @@ def profile_of(tmp_path, name, load, *changes):
 
 
 def canopen(tmp_path, factor, *changes, worn=False):
-    """``factor``: by how much the host's unit is too small. ``worn``: the drive has the changes, too."""
+    """Return a CANopen rig. ``factor``: error of the host's unit. ``worn``: whether the drive has the changes too."""
     wrong = (
         ("  rpm_per_lsb: 0.1\n", f"  rpm_per_lsb: {0.1 / factor:.6g}\n"),
         ("max_motor_speed_rpm_per_lsb: 1.0", "max_motor_speed_rpm_per_lsb: null"),
@@ -153,7 +153,7 @@ def modbus(tmp_path, factor, *changes):
     wrong = (
         ("register: {address: 1, type: i32}, per_lsb: 0.01, unit: rpm", "register: {address: 1, type: i32}, " + told),
         ("register: {address: 17, type: i32}, per_lsb: 0.01, unit: rpm", "register: {address: 17, type: i32}, " + told),
-        # What would show it before motion: the echo of the setpoint, and the limits of speed.
+        # Signs before motion: the echo of the setpoint, and the limits of speed.
         ("  - {setpoint: speed, register: {address: 48, type: i32}, per_lsb: 0.001, unit: rpm, "
          "source: this project's own map, confidence: verified}\n", ""),
         ("    set_to: speed_limit\n", ""),
@@ -172,7 +172,7 @@ SPEED = "speed:\n  rpm_per_lsb"
 
 
 def angle(keys):
-    """Where the drive counts its angle, in front of the unit of its speed."""
+    """Make the drive count its angle before the conversion of the speed unit."""
     return f"position:\n  {keys}\n  source: a test\n  confidence: verified\n{SPEED}"
 
 
@@ -226,7 +226,7 @@ def test_the_angle_shows_a_unit_that_is_too_small(made, seen, bus, factor):
 @pytest.mark.heavy
 @both
 def test_a_unit_that_is_too_large(made, bus):
-    """Ten times too slow is no danger, but a wrong inertia; the shaft is let turn at the slow speed only."""
+    """A shaft that is ten times too slow is no danger, but gives a wrong J. It turns at the slow speed only."""
     rig = made(bus, 0.25)
     cause = rig.run().cause
     assert exit_code(cause) == 4
@@ -241,7 +241,7 @@ def test_without_an_angle_the_operator_says_no(made, seen, bus):
     cause = rig.run(simulated=False, confirm_speed=rig.says(False)).cause
     assert exit_code(cause) == 4
     (reported, true, why), = rig.asked
-    assert reported == pytest.approx(2.0 * math.pi / 12.0, rel=0.05)        # once every 12 s, it says
+    assert reported == pytest.approx(2.0 * math.pi / 12.0, rel=0.05)        # the question states once every 12 s
     assert true == pytest.approx(10.0 * reported, rel=0.1)
     assert "reports no position" in why
     assert_stopped_in_time(rig)
@@ -261,7 +261,7 @@ def test_without_an_angle_and_with_nobody_there(made, seen, bus):
 
 @pytest.mark.heavy
 @both
-def test_the_operator_says_yes_to_a_right_unit(made, bus):
+def test_the_operator_confirms_a_right_unit(made, bus):
     rig = made(bus, 1.0, NO_ANGLE[bus])
     assert isinstance(rig.run(simulated=False, confirm_speed=rig.says(True)).cause, Enough)
     (reported, true, _), = rig.asked
@@ -271,7 +271,7 @@ def test_the_operator_says_yes_to_a_right_unit(made, bus):
 
 @pytest.mark.heavy
 @both
-def test_taken_by_name_nobody_is_asked(made, bus):
+def test_with_the_override_there_is_no_question(made, bus):
     rig = made(bus, 1.0, NO_ANGLE[bus])
     limits = replace(LIMITS, accept_speed_unit=True)
     assert isinstance(rig.run(simulated=False, limits=limits).cause, Enough)
@@ -282,7 +282,7 @@ def test_taken_by_name_nobody_is_asked(made, bus):
 
 @pytest.mark.heavy(but_first=1)
 @both
-def test_a_name_does_not_take_a_shaft_that_would_be_too_fast(made, bus):
+def test_the_override_does_not_accept_a_shaft_that_would_be_too_fast(made, bus):
     rig = made(bus, 10.0)
     cause = rig.run(simulated=False, limits=replace(LIMITS, accept_speed_unit=True)).cause
     assert exit_code(cause) == 4
@@ -292,8 +292,8 @@ def test_a_name_does_not_take_a_shaft_that_would_be_too_fast(made, bus):
 
 @pytest.mark.heavy
 @both
-def test_a_name_takes_counts_that_are_wrong_where_no_harm_follows(made, bus):
-    """A good unit of speed, and an encoder said to have twice the counts that it has."""
+def test_the_override_accepts_wrong_counts_without_a_hazard(made, bus):
+    """The unit of speed is right, and the profile states twice the counts of the encoder."""
     old, new = {
         canopen: (SPEED, angle("counts_per_turn: 16384")),
         modbus: ("counts_per_turn: 4096", "counts_per_turn: 8192"),
@@ -309,7 +309,7 @@ def test_a_name_takes_counts_that_are_wrong_where_no_harm_follows(made, bus):
 
 @pytest.mark.heavy
 @both
-def test_a_simulated_drive_without_an_angle_goes_on_with_a_note(made, bus):
+def test_a_simulated_drive_without_an_angle_continues_with_a_note(made, bus):
     rig = made(bus, 1.0, NO_ANGLE[bus])
     assert isinstance(rig.run().cause, Enough)
     assert not rig.asked
@@ -325,7 +325,7 @@ def test_a_right_unit_is_seen_to_be_right_without_a_pause(made, bus):
         assert isinstance(one.run().cause, Enough)
     assert rig.log.run["speed_unit"]["ratio"] == pytest.approx(1.0, abs=0.005)
     assert speed_check.speed_warnings(rig.log.run) == ()
-    # No cycle of its own; on Modbus its requests take time on the line, which shifts the noise.
+    # The check takes no cycle. On Modbus its requests take time on the line, which shifts the noise.
     assert rig.log.cycles == pytest.approx(plain.log.cycles, abs=0 if bus is canopen else 20)
 
 
@@ -353,7 +353,7 @@ def test_other_angles(made, kind, factor):
 
 
 def spoiled(rig, read):
-    """The simulated drive's 6064h as ``read`` makes it of the true count."""
+    """Replace 6064h of the simulated drive by ``read`` of the true count."""
     live = rig.node.store.live
     true = live[0x6064 << 8]
     live[0x6064 << 8] = lambda: read(true())
@@ -385,8 +385,8 @@ def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("bus", "reading"), [(canopen, 3), (canopen, 40), (modbus, 12)])
-def test_an_angle_read_on_waking_up_is_no_wrong_unit(made, bus, reading):
-    """What stopped the drive is told."""
+def test_an_angle_read_after_a_freeze_is_no_wrong_unit(made, bus, reading):
+    """The message states the cause of the drive's stop."""
     rig = made(bus, 1.0)
     rig.drive = Waking(rig.drive, reading)
     cause = rig.run().cause
@@ -395,7 +395,7 @@ def test_an_angle_read_on_waking_up_is_no_wrong_unit(made, bus, reading):
 
 
 @pytest.mark.heavy
-def test_an_angle_that_stands_still_in_a_simulated_drive(made):
+def test_a_constant_angle_of_a_simulated_drive(made):
     rig = made(canopen, 1.0)
     spoiled(rig, lambda counts: 0)
     cause = rig.run().cause
@@ -405,7 +405,7 @@ def test_an_angle_that_stands_still_in_a_simulated_drive(made):
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize(("increments", "turns"), [(1, 1), (8192, 0), (0, 1)])
-def test_no_increments_for_a_turn_are_none(made, increments, turns):
+def test_zero_increments_per_turn_give_no_angle(made, increments, turns):
     rig = made(canopen, 1.0)
     rig.node.store.values[0x608F01] = increments
     rig.node.store.values[0x608F02] = turns

@@ -1,4 +1,4 @@
-"""Rows beyond the fifty that the guard, the string's rules, the stop and the end of a run answer for."""
+"""Rows beyond the fifty that the guard, the rules for a string, the stop and the end of a run handle."""
 
 import os
 from pathlib import Path
@@ -25,7 +25,7 @@ def test_a_string_and_a_quick_stop_that_lets_go(drive, profile, rehearse, tmp_pa
     ("canopen", "write-not-kept", "sto@speed", 4), ("modbus", "write-not-kept", "drive-fault@speed", 4),
 ])
 def test_a_fault_that_never_comes_is_said(drive, first, never, code, rehearse, seen):
-    """Those that came aren't; those from the start came also where the run was refused."""
+    """Faults that occurred are not listed. Faults from the start count as occurred, even in a refused run."""
     run = rehearse("--drive", drive, "--fault", first, "--fault", never)
     assert run.done.code == code, run.done.err
     (said,) = [line for line in run.done.err.splitlines() if "was not triggered" in line]
@@ -53,7 +53,7 @@ def test_a_mode_that_is_lost_in_motion(drive, when, rehearse, seen):
 @pytest.mark.heavy
 @pytest.mark.parametrize("drive", ["canopen", "modbus"])
 def test_a_shaft_that_does_not_follow_in_speed_mode(drive, rehearse, seen):
-    """Torque enough for a tenth of the limit, and friction takes more."""
+    """The torque is sufficient for a tenth of the limit, and friction needs more."""
     run = rehearse("--drive", drive, "--fault", "internal-limit@speed+8s=10%")
     run.assert_ended(7, "does not follow", "deviating since", "limit", "brake or the load")
     standstill_s = run.assert_stopped(run.fault_s, 8.0)
@@ -61,7 +61,7 @@ def test_a_shaft_that_does_not_follow_in_speed_mode(drive, rehearse, seen):
 
 
 def _thread_dies(path):
-    """As where memory runs out in it: whatever it does next raises."""
+    """Make the next call in the thread raise, as if it ran out of memory."""
     def dead(*_arguments):
         raise SystemExit("killed")
 
@@ -74,7 +74,7 @@ def _thread_dies(path):
     (_thread_dies, "killed"),
 ], ids=["removed", "cut short", "thread dies"])
 def test_a_log_that_is_taken_away(how, said, rehearse, monkeypatch, tmp_path, seen):
-    monkeypatch.setattr(Pump, "_drain", Pump._drain)           # put back afterwards
+    monkeypatch.setattr(Pump, "_drain", Pump._drain)           # restored afterwards
     acted = at(monkeypatch, "speed", 15.0, lambda sample: how(tmp_path / "run.mcap"))
     run = rehearse()
     run.assert_ended(3, "can't be written any more", said, "run.mcap")

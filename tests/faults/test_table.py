@@ -1,4 +1,4 @@
-"""The table in the documentation: all fifty rows and those beyond, and every test that it names exists."""
+"""Table in the documentation: it has all fifty rows and those beyond, and every test that it names exists."""
 
 import re
 from pathlib import Path
@@ -34,7 +34,7 @@ def test_every_named_test_exists(text):
 
 
 def test_every_scripted_fault_is_rehearsed():
-    """Each name that the simulator knows stands in one of this room's tests."""
+    """Each fault name of the simulator occurs in a test of this room."""
     from sim_bus.canopen.faults import KINDS
 
     source = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py"))
@@ -52,7 +52,7 @@ QUOTED = (*CANOPEN, *(case for case in ETHERCAT if ROWS[case.row].fault.startswi
 
 @pytest.mark.parametrize("case", QUOTED, ids=lambda case: case.id)
 def test_a_quotation_has_the_words_that_its_case_requires(case, text):
-    """A message that is worded anew is quoted anew. The page quotes a row of all buses from CANopen."""
+    """A changed message needs a changed quotation. For a row of all buses, the page quotes CANopen."""
     row = re.search(rf"^\| {case.row} \| .*$", text, re.MULTILINE)
     assert row is not None
     quoted = [one for one in re.split(r"<br>| \| ", row[0]) if one.startswith(f"`{case.fault}`: ")]

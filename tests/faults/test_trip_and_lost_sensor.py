@@ -1,4 +1,4 @@
-"""A drive that trips while its speed signal is lost: the lag of the report hides that the shaft still turns."""
+"""Drive that trips while its speed signal is lost: the lag of the report hides the motion of the shaft."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ FASTEST_AT_REST_RAD_S = 0.2
 
 
 def speed_when_seen(run):
-    """True speed at the moment at which the shaft was reported to be at standstill; None if it was not."""
+    """Return the true speed at the time of the reported standstill, or None if none was reported."""
     seen_s = outcome_of(run.done.code, run.done.document, run.done.err, log_closed=True).seen_s
     return None if seen_s is None else abs(float(np.interp(seen_s, run.shaft.time_s, run.shaft.speed_rad_s)))
 
@@ -27,7 +27,7 @@ def test_before_j_is_known_it_confirms_nothing(drive, trip, rehearse):
 
 
 @pytest.mark.heavy
-def test_once_j_is_known_it_waits_for_the_longest_run_out(rehearse):
+def test_once_j_is_known_it_waits_for_the_longest_coasting_time(rehearse):
     run = rehearse("--fault", "sto@torque+2s", "--fault", "sensor-lost@torque+2s")
     assert run.done.code == ExitCode.DRIVE_FAULT
     assert speed_when_seen(run) < FASTEST_AT_REST_RAD_S

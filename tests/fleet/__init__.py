@@ -1,1 +1,1 @@
-"""Many logs."""
+"""Tests of many logs."""

@@ -5,7 +5,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def few(tmp_path_factory):
-    """Three runs of one rig, and what a folder may hold besides."""
+    """Return three runs of one rig in a folder with other files."""
     from tests.fleet.simulated_logs import rig_plants, write_rig
 
     folder = tmp_path_factory.mktemp("fleet") / "logs"

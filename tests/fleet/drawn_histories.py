@@ -8,7 +8,7 @@ KINDS = {"none": 0.0, "step 1 %": 0.01, "step 2 %": 0.02, "step 5 %": 0.05, "dri
 
 
 def draw(rng: np.random.Generator, kind: str, results: int, scatter: float = 1.0) -> tuple[list[Measured], int]:
-    """Return one history, and where its step is."""
+    """Return one history and the position of its step."""
     size, at = KINDS[kind], int(rng.integers(3, results - 2))
     scale = 1.0 + 0.03 * rng.standard_normal()
     found = []

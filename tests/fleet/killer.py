@@ -10,7 +10,7 @@ from tdhil.fleet import FleetRow
 
 
 class Killer:
-    """Kills processes of the pool, or of a cluster, at random while rows come in."""
+    """Killer of random processes of a pool or a cluster while rows arrive."""
 
     def __init__(self, kills: int, victims: Any) -> None:
         self.kills, self._left, self._victims, self._rng = 0, kills, victims, random.Random(11)
@@ -57,8 +57,10 @@ def pool_processes(of: int) -> list[int]:
 
 
 def cluster_processes(cluster: Any, workers_too: bool) -> list[int]:
-    """The process that each worker of Dask keeps; and the workers, but for those that are still beginning: one that is
-    killed then is given up by its nanny.
+    """Return the processes of Dask's workers, and the workers except for starting ones.
+
+    A worker that is killed while it starts is given up by its nanny.
+
     """
     workers = [nanny.pid for nanny in cluster.workers.values() if nanny.status.name == "running" and nanny.pid]
     return (workers if workers_too else []) + [pid for worker in workers for pid in pool_processes(worker)]

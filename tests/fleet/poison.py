@@ -1,5 +1,6 @@
-"""What a log may do to the process that reads it. Told by the file's first bytes; the function is one of a module, so
-that the pool's processes and a cluster's find it by name.
+"""Logs that disturb the process that reads them. The first bytes of a file select the effect.
+
+The functions are in a module, so that processes of a pool or cluster find them by name.
 """
 
 import os
@@ -23,7 +24,7 @@ def head_of(path):
 
 
 def identify(task: LogTask) -> Done:
-    """As `identify_log`, but for poisoned logs."""
+    """Identify as `identify_log` does, except for poisoned logs."""
     try:
         act(head_of(task.log))
     except MemoryError as error:
@@ -33,7 +34,7 @@ def identify(task: LogTask) -> Done:
 
 
 def quick(task: LogTask) -> Done:
-    """A row without identifying; a note of each call in the file that TDHIL_CALLS names."""
+    """Return a row without identification, and record each call in the file that TDHIL_CALLS names."""
     head = head_of(task.log)
     if head.startswith(b"poison") or not Path(task.log).is_file():
         return identify(task)
@@ -45,13 +46,13 @@ def quick(task: LogTask) -> Done:
 
 
 def quick_at_first(task: LogTask) -> Done:
-    """As `quick`, until there are twenty notes; whoever comes then waits until he is ended."""
+    """Act as `quick` for twenty calls; later calls wait until their process is ended."""
     if len(Path(os.environ["TDHIL_CALLS"]).read_text().split()) >= 20:
         time.sleep(3600)
     return quick(task)
 
 
 def quick_anywhere(task: LogTask) -> Done:
-    """The same of a log behind an address."""
+    """Act as `quick` for a log behind an address."""
     with local_copy(task.log) as path:
         return replace(done := quick(replace(task, log=str(path))), row=replace(done.row, log=task.log))

@@ -1,4 +1,4 @@
-"""Real run.mcap files of simulated rigs by the hundred: the studies' batch simulator and the log's own container."""
+"""Hundreds of real run.mcap files of simulated rigs, by the batch simulator of the studies and the log container."""
 
 import json
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ PERIODS = 6
 
 
 def rig_plants(count: int) -> list[CoveragePlant]:
-    """Rigs of different size, each with its own lags."""
+    """Return rigs of different size, each with its own lags."""
     rng = np.random.default_rng(17)
     plants = []
     for number in range(count):
@@ -38,8 +38,10 @@ def write_log(
     path: Path, recording: Recording, rig: str, number: int, result: dict[str, object] | None = None,
     aborted_by: str | None = None, faults: tuple[str, ...] = (),
 ) -> None:
-    """The recording as a finished log of rig ``rig``, a run each week; ``aborted_by``: the kind of error that did;
-    ``faults``: rehearsed in the run.
+    """Write the recording as a finished log of rig ``rig``, with one run per week.
+
+    ``aborted_by``: kind of error that ended the run. ``faults``: rehearsed faults.
+
     """
     epoch_ns = int((BEGAN + timedelta(weeks=number)).timestamp() * 1e9)
     run = {
@@ -75,7 +77,7 @@ def write_log(
                 container.close_chunk()
         colds = [excitation_message(recording.excitation, recording.levels, recording.ramps),
                  stage_message(
-                 Stage("acquire", began, last, "ok") if aborted_by is None      # a moment later, with all that counts
+                 Stage("acquire", began, last, "ok") if aborted_by is None      # a little later than all relevant data
                  else Stage("acquire", began, last + 1.0, "aborted"))]
         if result is not None:
             colds.append(result_message(result))
@@ -88,7 +90,7 @@ def write_log(
 def write_rig(
     folder: Path, plant: CoveragePlant, count: int, seed: int, periods: int = PERIODS, group: int = 50
 ) -> Iterator[Path]:
-    """``count`` runs of one rig, R7-003.mcap and the like."""
+    """Write ``count`` runs of one rig, as R7-003.mcap and so on."""
     for first in range(0, count, group):
         numbers = range(first, min(first + group, count))
         seeds = [(seed, int(plant.name[1:]), number) for number in numbers]
@@ -99,7 +101,7 @@ def write_rig(
 
 
 def result_of(path: Path) -> dict[str, object]:
-    """The document that a replay gives."""
+    """Return the document of a replay."""
     import tdhil
 
     return json.loads(json.dumps(tdhil.identify(tdhil.read(path)).to_dict()))

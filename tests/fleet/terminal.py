@@ -1,4 +1,4 @@
-"""`tdhil fleet` in a terminal of its own, where somebody presses Ctrl-C: its whole foreground group gets the signal."""
+"""`tdhil fleet` in its own terminal with Ctrl-C: the whole foreground group receives the signal."""
 
 import os
 import pty
@@ -22,7 +22,7 @@ sys.exit(main(["fleet", *sys.argv[2:]]))
 
 
 def fleet_with_ctrl_c(function, arguments, when):
-    """Its exit code; ``function``: one of `poison`; ``when``: asked all the time, True presses Ctrl-C, once."""
+    """Return the exit code. ``function``: one of `poison`. ``when``: called repeatedly; the first True sends Ctrl-C."""
     ours, theirs = pty.openpty()
     try:
         with subprocess.Popen([sys.executable, "-c", _SCRIPT, function, *arguments], stdin=theirs, stdout=theirs,

@@ -1,4 +1,4 @@
-"""Runs that the service archived are left out of fleet, trend and compare on the command line, unless asked for."""
+"""Runs that the service archived: fleet, trend and compare leave them out without a request."""
 
 import json
 
@@ -11,7 +11,7 @@ from tdhil.fleet.table import write_table
 
 @pytest.fixture
 def runs(tmp_path):
-    """Three runs of a service: one as it was, one archived, one with a tag and a broken file of another."""
+    """Return three runs of a service: a normal one, an archived one, one with a tag and a damaged file of another."""
     marks = {"a": None, "b": '{"archived": true}', "c": '{"archived": false, "tags": ["x"]}', "d": "["}
     for name, text in marks.items():
         (tmp_path / name).mkdir()
@@ -21,7 +21,7 @@ def runs(tmp_path):
     return tmp_path
 
 
-def test_the_mark_is_read_beside_the_log(runs):
+def test_the_mark_beside_the_log_is_read(runs):
     assert [name for name in "abcd" if is_archived(runs / name / "run.mcap")] == ["b"]
     assert not is_archived("s3://bucket/run.mcap") and not is_archived("nowhere/run.mcap")
 
@@ -42,7 +42,7 @@ def test_compare_refuses_an_archived_run_by_name(runs, capsys):
     assert "archived this run" not in capsys.readouterr().err
 
 
-def test_a_trend_leaves_out_runs_that_were_archived_after_the_table_was_made(runs, capsys):
+def test_a_trend_leaves_out_runs_archived_after_the_table(runs, capsys):
     table = runs / "fleet.csv"
     write_table([FleetRow(str(runs / name / "run.mcap"), "valid", rig="R", date=f"2026-05-0{day}T12:00:00+00:00",
                           inertia_kg_m2=104.0, inertia_low_kg_m2=103.0, inertia_high_kg_m2=105.0, drive_serial=7)

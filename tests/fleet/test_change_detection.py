@@ -1,4 +1,4 @@
-"""Differences and histories against what is worked out another way: by simulation, and by the densities themselves."""
+"""Differences and histories, compared with simulation and with the densities themselves."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_the_interval_of_a_difference_covers():
     assert all(0.935 < hit / 2000 < 0.965 for hit in hits.values())
 
 
-def test_what_may_be_zero_is_compared_without_a_logarithm():
+def test_quantities_that_may_be_zero_are_compared_without_a_logarithm():
     told = difference(Measured(-0.001, -0.003, 0.001), Measured(0.005, 0.003, 0.007))
     assert not told.relative
     assert told.change == pytest.approx(0.006)
@@ -51,7 +51,7 @@ def test_what_may_be_zero_is_compared_without_a_logarithm():
 
 
 def test_the_evidence_is_that_of_the_densities(monkeypatch):
-    """One κ and one τ: against multivariate normal densities with a mean that is as good as flat."""
+    """With one κ and one τ, the oracle is multivariate normal densities with a nearly flat prior of the mean."""
     monkeypatch.setattr(change_detection, "_SPREAD", ((1.4, 1.0),))
     monkeypatch.setattr(change_detection, "_SIZES", (8.0,))
     rng = np.random.default_rng(3)
@@ -74,7 +74,7 @@ def test_the_evidence_is_that_of_the_densities(monkeypatch):
     found = change_detection._evidence(known)
     assert [found.none, found.step, found.drift] == pytest.approx(np.array(weights) / sum(weights), rel=1e-3)
     assert found.places == pytest.approx(np.array(each[:-1]) / sum(each[:-1]), rel=1e-3)
-    # The size by regression with a prior of its own: mean and covariance of level and size for each place
+    # The size by regression with its own prior: mean and covariance of level and size for each place
     inverse, posterior = np.linalg.inv(covariance), []
     for share, shape in zip(found.places, shapes[:-1], strict=True):
         design = np.column_stack((np.ones(n), shape))
@@ -89,7 +89,7 @@ def test_the_evidence_is_that_of_the_densities(monkeypatch):
 
 
 def test_a_long_history_needs_no_matrix_of_its_length(monkeypatch):
-    """1000 results took seconds: each factor inverted a matrix of 1000 by 1000, and the page waited."""
+    """1000 results used to take seconds: each factor inverted a 1000 by 1000 matrix, which delayed the page."""
     sizes = []
     for name in ("inv", "slogdet", "solve"):
         made = getattr(np.linalg, name)
@@ -114,7 +114,7 @@ def test_a_scale_of_3_percent_neither_hides_a_step_nor_makes_one(kind, least, mo
         assert one_history.none + one_history.step + one_history.drift == pytest.approx(1.0)
 
 
-def test_where_and_how_large_a_step_is():
+def test_place_and_size_of_a_step():
     rng = np.random.default_rng(2)
     results, at = draw(rng, "step 5 %", 24)
     found = history(results)
@@ -126,8 +126,8 @@ def test_where_and_how_large_a_step_is():
 
 
 @pytest.mark.parametrize(("kind", "results"), [("step 1 %", 12), ("step 1 %", 20), ("step 2 %", 12)])
-def test_the_size_of_a_step_that_is_rarely_seen_covers(kind, results):
-    """Such a step is seen where chance makes it large. At its most probable place alone, 82 to 94 % covered."""
+def test_the_size_of_a_rarely_found_step_covers(kind, results):
+    """Chance determines whether such a step is found. At its most probable place alone, 82 to 94 % covered."""
     rng = np.random.default_rng([3, results, round(1000 * KINDS[kind])])
     found = [history(draw(rng, kind, results)[0]).changes for _ in range(300)]
     sizes = [steps[0].change for steps in found if len(steps) == 1]
@@ -136,7 +136,7 @@ def test_the_size_of_a_step_that_is_rarely_seen_covers(kind, results):
 
 
 def test_the_size_of_a_doubtful_step_includes_none():
-    """Where "no change" has more than half of what the interval leaves out, the interval reaches to 0."""
+    """The interval contains 0 if "no change" has more than half of the probability outside of the interval."""
     rng = np.random.default_rng(21)
     doubtful = [(told, step) for told in (history(draw(rng, "step 1 %", 12)[0]) for _ in range(200))
                 for step in told.changes if len(told.changes) == 1]
@@ -156,7 +156,7 @@ def test_two_steps_are_two():
 
 
 STEPS = {10: 0.04, 20: -0.03}
-"""Two steps in 30 results: number of the first result behind each, and its size."""
+"""Two steps in 30 results: number of the first result after each, and its size."""
 
 
 @pytest.mark.parametrize("scatter", [1.0, 0.6])
@@ -191,7 +191,7 @@ def test_a_drive_that_was_replaced_explains_a_step_of_its_scale():
     assert not told("b").changed
 
 
-def test_units_and_order_don_t_matter_and_too_few_are_refused():
+def test_units_and_order_have_no_effect_and_too_few_are_refused():
     rng = np.random.default_rng(6)
     results, _ = draw(rng, "step 1 %", 12)
     scaled = [Measured(3 * r.value, 3 * r.low, 3 * r.high, r.confidence, r.scale_rel_sd, r.drive, r.time)

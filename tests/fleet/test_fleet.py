@@ -1,4 +1,4 @@
-"""Many logs into one table: whole, cut, corrupt, foreign and poisoned; interrupted and started again; by each road."""
+"""Many logs in one table: complete, truncated, corrupt, foreign, poisoned; interrupted and restarted; each executor."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def calls(tmp_path, monkeypatch):
 
 
 def many(folder, count, bad=()):
-    """So many little files that `poison.quick` takes for logs."""
+    """Write this number of small files that `poison.quick` accepts as logs."""
     folder.mkdir(exist_ok=True)
     for number in range(count):
         (folder / f"{number:03d}.mcap").write_bytes(f"log {number}".encode())
@@ -61,7 +61,7 @@ def many(folder, count, bad=()):
 
 
 def trace(folder, record):
-    """The samples of a recording as a CSV with its sidecar."""
+    """Write the samples of a recording as a CSV with its sidecar."""
     columns = zip(record.time_s, record.speed_rad_s * 60 / 2 / np.pi, record.torque_nm, strict=True)
     (folder / "trace.csv").write_text("t,n,m\n" + "".join(f"{t:.5f},{n:.6f},{m:.6f}\n" for t, n, m in columns))
     (folder / "trace.yaml").write_text(
@@ -69,7 +69,7 @@ def trace(folder, record):
         "torque_scale_rel_sd: 0.02\n")
 
 
-def test_one_log_is_what_replay_gives(few):
+def test_one_log_gives_the_result_of_replay(few):
     import tdhil
 
     done = identify_log(LogTask(str(few / "R1-001.mcap")))
@@ -83,8 +83,8 @@ def test_one_log_is_what_replay_gives(few):
 
 
 @pytest.mark.heavy
-def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
-    """By the row, the summary, trend, compare and watch; a whole run's row says nothing of the kind."""
+def test_a_result_from_a_part_of_a_run_is_marked(few, tmp_path, capsys):
+    """The row, the summary, trend, compare and watch mark it. The row of a whole run has no mark."""
     import tdhil
 
     logs = tmp_path / "logs"
@@ -130,7 +130,7 @@ def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
     assert (first.cached, second.cached) == (False, True)
     assert repr(first.row) == repr(second.row) == repr(plain.row)
     (kept,) = tmp_path.iterdir()
-    kept.write_bytes(kept.read_bytes()[:-500])             # damaged: read anew, and written anew
+    kept.write_bytes(kept.read_bytes()[:-500])             # damaged: read and written again
     assert repr(identify_log(task).row) == repr(first.row)
     assert identify_log(task).cached
     copy = tmp_path / "copy.mcap"
@@ -142,7 +142,7 @@ def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
 
 @pytest.mark.heavy
 def test_one_process_two_or_a_cluster_of_two_give_the_same_table(few, tmp_path):
-    """A small benchmarks/fleet_thousand.py."""
+    """This is a small version of benchmarks/fleet_thousand.py."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
     request = FleetRequest((str(few),), tmp_path / "one.csv", cache=False)
     tables = [run_fleet(request).rows, run_fleet(replace(request, out=tmp_path / "two.csv", jobs=2)).rows]
@@ -154,7 +154,7 @@ def test_one_process_two_or_a_cluster_of_two_give_the_same_table(few, tmp_path):
 
 @pytest.mark.heavy
 def test_a_cluster_s_processes_killed_at_random(tmp_path, calls):
-    """Dask's own workers, and the process that each keeps: nothing is lost, nothing comes twice."""
+    """Dask's workers and their processes are killed. No row is lost and none is duplicated."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
     import dask
 
@@ -195,8 +195,8 @@ def test_every_kind_of_file_has_its_row(few, tmp_path):
 
 
 @pytest.mark.heavy
-def test_poisoned_logs_are_set_aside(tmp_path, calls, monkeypatch):
-    """The time of the limit goes on only while nothing but what hangs is left: no slow computer loses the others."""
+def test_poisoned_logs_are_isolated(tmp_path, calls, monkeypatch):
+    """The time limit counts only while no other log is left, so a slow computer loses no other logs."""
     bad, seen = (poison.KILLS, poison.HANGS, poison.EATS, poison.OUTSIDE), []
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() if len(seen) == 15 else 0.0)
     monkeypatch.setattr(process_pool, "time", clock)
@@ -211,7 +211,7 @@ def test_poisoned_logs_are_set_aside(tmp_path, calls, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_killed_at_random_and_nothing_is_lost_or_twice(tmp_path, calls):
+def test_killed_at_random_no_row_is_lost_or_duplicated(tmp_path, calls):
     rng, pools = random.Random(2), []
 
     class Killer:
@@ -249,7 +249,7 @@ def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
     assert (first.interrupted, len(first.rows), first.left) == (True, 15, 25)
     assert len(read_table(request.out)) == 15
     calls.write_text("")
-    (tmp_path / "logs" / "003.mcap").rename(tmp_path / "logs" / "moved.mcap")      # known by its content
+    (tmp_path / "logs" / "003.mcap").rename(tmp_path / "logs" / "moved.mcap")      # recognised by its content
     second = run_fleet(request, function=poison.quick)
     assert (len(second.rows), second.left) == (40, 0)
     done = calls.read_text().split()
@@ -264,8 +264,8 @@ def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
 
 
 @pytest.mark.heavy
-def test_told_to_stop_it_leaves_what_is_in_hand(tmp_path, calls):
-    """Also one that hangs; and the same again does the rest."""
+def test_a_stop_abandons_the_logs_in_progress(tmp_path, calls):
+    """This includes a log that hangs. A second call identifies the rest."""
     request = FleetRequest(many(tmp_path / "logs", 30, (poison.HANGS,)), tmp_path / "fleet.csv", jobs=2)
     seen = []
 
@@ -285,7 +285,7 @@ def test_told_to_stop_it_leaves_what_is_in_hand(tmp_path, calls):
 
 @pytest.mark.heavy
 def test_ctrl_c_in_a_terminal_and_the_same_command_again(tmp_path, calls):
-    """The whole foreground group gets the signal, as from a keyboard: the processes at work are in none of it."""
+    """The whole foreground group receives the signal, as from a keyboard. The worker processes are not in it."""
     pytest.importorskip("pty")
     from tests.fleet.terminal import fleet_with_ctrl_c
 
@@ -294,14 +294,14 @@ def test_ctrl_c_in_a_terminal_and_the_same_command_again(tmp_path, calls):
     arguments = [folder, "--out", str(out), "--jobs", "2"]
     assert fleet_with_ctrl_c("quick_at_first", arguments, lambda: len(calls.read_text().split()) >= 20) == 130
     done = {row.log for row in read_table(out)}
-    assert 10 <= len(done) < 120                       # of twenty begun, what was in hand is gone
+    assert 10 <= len(done) < 120                       # of twenty begun logs, those in progress are lost
     calls.write_text("")
     summary = run_fleet(FleetRequest((folder,), out, jobs=2), function=poison.quick)
     assert (summary.done_before, len(summary.rows)) == (len(done), 120)
     assert sorted(calls.read_text().split()) == sorted({row.log for row in summary.rows} - done)
 
 
-def test_live_logs_and_pipes_are_left_alone(tmp_path):
+def test_live_logs_and_pipes_are_ignored(tmp_path):
     fcntl = pytest.importorskip("fcntl")
     many(tmp_path / "logs", 2)
     os.mkfifo(tmp_path / "logs" / "pipe.mcap")
@@ -318,7 +318,7 @@ def test_live_logs_and_pipes_are_left_alone(tmp_path):
 
 
 def test_a_log_that_may_not_be_read_has_a_row(tmp_path, few, monkeypatch):
-    """And is tried again the next time, since nothing is known of its content."""
+    """It is tried again the next time, since its content is unknown."""
     log = tmp_path / "locked.mcap"
     shutil.copy(few / "R1-000.mcap", log)
     from tdhil.fleet import task
@@ -333,7 +333,7 @@ def test_a_log_that_may_not_be_read_has_a_row(tmp_path, few, monkeypatch):
 
 @pytest.fixture
 def bucket(few):
-    """Two logs and something else in fsspec's memory, which only this process has."""
+    """Put two logs and another file into fsspec's memory, which only this process has."""
     memory = pytest.importorskip("fsspec").filesystem("memory")
     memory.put(str(few / "R1-000.mcap"), "/logs/R1-000.mcap")
     memory.pipe({"/logs/below/empty.mcap": b"", "/logs/read.me": b"no log"})
@@ -354,11 +354,11 @@ def test_logs_behind_an_address(few, bucket, monkeypatch):
         find_logs(("s3://bucket/logs",))
 
 
-def test_an_address_that_can_t_be_reached_is_no_mistake_of_ours(bucket, monkeypatch):
+def test_an_unreachable_address_is_no_bug(bucket, monkeypatch):
     from fsspec.implementations.memory import MemoryFileSystem
 
     class NoCredentials(Exception):
-        """As boto's: of no tree that we know."""
+        """Exception without a known base class, as boto raises."""
 
     def refuse(*_, **__):
         raise NoCredentials("no credentials")
@@ -373,8 +373,8 @@ def test_an_address_that_can_t_be_reached_is_no_mistake_of_ours(bucket, monkeypa
 
 
 @pytest.mark.heavy
-def test_what_was_done_behind_an_address_is_not_fetched_again(tmp_path, calls):
-    """By file://, which the pool's processes reach, too."""
+def test_an_identified_log_behind_an_address_is_not_fetched_again(tmp_path, calls):
+    """The address is file://, which the processes of the pool also reach."""
     pytest.importorskip("fsspec")
     (folder,) = many(tmp_path / "logs", 4)
     request = FleetRequest((f"file://{folder}",), tmp_path / "fleet.csv", jobs=1)
@@ -387,7 +387,7 @@ def test_what_was_done_behind_an_address_is_not_fetched_again(tmp_path, calls):
 
 @pytest.mark.heavy
 def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
-    """Dask's scheduler and a worker of it in this process; the log is read in one beside it, as ever."""
+    """Dask's scheduler and a worker run in this process. The log is read in another process, as always."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
     roots = many(tmp_path / "logs", 6, (poison.KILLS,))
     here = run_fleet(FleetRequest(roots, tmp_path / "here.csv", jobs=1), function=poison.quick)
@@ -406,7 +406,7 @@ def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
 
 
 def test_a_run_refused_before_motion_is_no_failure_of_the_fleet(tmp_path):
-    """tdhil's own run.refused.mcap is whole. It has no result, and none is missing."""
+    """The log run.refused.mcap of tdhil is complete. It has no result, and none is expected."""
     rows = (FleetRow("run.mcap", "valid"),
             FleetRow("run.refused.mcap", "unread", error_kind="NothingRecorded"))
     assert FleetSummary(rows, tmp_path / "fleet.csv").exit_code == 0
@@ -452,13 +452,13 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_watch_takes_what_rests_and_leaves_what_grows(tmp_path):
+def test_watch_reads_complete_logs_and_waits_for_growing_ones(tmp_path):
     from tdhil.cli.fleet import FolderWatch
 
     folder = tmp_path / "logs"
     many(folder, 2)
     watch = FolderWatch(FleetRequest((str(folder),), tmp_path / "fleet.csv", jobs=1))
-    assert watch.look() == []                              # seen for the first time: it may be growing
+    assert watch.look() == []                              # found for the first time: it may be growing
     growing = folder / "growing.mcap"
     growing.write_bytes(b"half")
     assert [Path(row.log).name for row in watch.look()] == ["000.mcap", "001.mcap"]

@@ -1,4 +1,4 @@
-"""Rehearsals of faults are left out of fleet, trend and compare unless asked for, and are marked where shown."""
+"""Rehearsals of faults: fleet, trend and compare leave them out without a request, and mark them if shown."""
 
 import json
 
@@ -16,7 +16,7 @@ MARKS = "SIMULATED · FAULT REHEARSAL"
 
 @pytest.fixture(scope="module")
 def logs(few, tmp_path_factory):
-    """A run and a rehearsal."""
+    """Return a run and a rehearsal."""
     import tdhil
 
     folder = tmp_path_factory.mktemp("rehearsed") / "logs"

@@ -1,4 +1,4 @@
-"""Rows, the journal, and the table in each of its kinds."""
+"""Rows, journal, and table in each format."""
 
 import csv
 import json
@@ -46,13 +46,13 @@ def test_a_table_is_read_back_to_the_last_bit(tmp_path, ending):
     assert sorted(one.name for one in tmp_path.iterdir()) == [path.name]
 
 
-def test_a_name_that_is_no_utf_8_has_a_row(tmp_path):
+def test_a_name_that_is_not_utf_8_has_a_row(tmp_path):
     write_table([FleetRow("R7-\udcff.mcap", "valid")], tmp_path / "fleet.csv")
     assert read_table(tmp_path / "fleet.csv")[0].log == "R7-?.mcap"
 
 
 def leads_somewhere(document, place):
-    """Whether every key of the path is there; a part that this run has not (drive, rig) ends it."""
+    """Return whether every key of the path exists. A part that this run does not have (drive, rig) ends the path."""
     for key in place.split("."):
         if document is None:
             return True
@@ -66,7 +66,7 @@ def leads_somewhere(document, place):
 
 
 def test_every_column_has_its_place_in_the_document():
-    """A misspelt place would be an empty column, with every log."""
+    """A misspelt path would give an empty column for every log."""
     document = result_document(full(), recording(), {}, "run.mcap")
     places = [place for one in fields(FleetRow) for place in one.metadata.get("places", ())]
     assert len(places) > 40
@@ -80,7 +80,7 @@ def test_every_quantity_has_its_unit():
     assert {one.name for one in fields(FleetRow)} == set(COLUMNS)
 
 
-def test_parquet_without_duckdb_says_how_to_get_it(tmp_path, monkeypatch):
+def test_parquet_without_duckdb_names_the_package(tmp_path, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "duckdb", None)
@@ -89,7 +89,7 @@ def test_parquet_without_duckdb_says_how_to_get_it(tmp_path, monkeypatch):
     check_table_path(tmp_path / "fleet.csv", tmp_path / "work")
 
 
-def test_a_foreign_file_is_left_as_it_is(tmp_path):
+def test_a_foreign_file_is_not_changed(tmp_path):
     (tmp_path / "fleet.csv").write_text("mine")
     with pytest.raises(UsageError, match="no fleet wrote"):
         check_table_path(tmp_path / "fleet.csv", tmp_path / "fleet.csv.work")
@@ -103,7 +103,7 @@ def test_a_foreign_file_is_left_as_it_is(tmp_path):
             read_table(tmp_path / f"fleet{ending}")
 
 
-def test_the_journal_loses_a_cut_line_only(tmp_path):
+def test_the_journal_loses_only_a_truncated_line(tmp_path):
     first, second = rows()[:2]
     with Journal(tmp_path) as journal:
         journal.add(replace(first, sha256="aa"), "k1", (5, 6))
@@ -126,7 +126,7 @@ def test_one_host_at_a_time(tmp_path):
 
 
 def test_the_page_has_every_column():
-    """`…` on the page stands for the rest of a name."""
+    """On the page, `…` replaces the rest of a name."""
     page = (Path(__file__).parents[2] / "docs/how-to/identify-many-logs.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`.*?`) \|", page, re.MULTILINE)
     whole, begun = set(), []
@@ -138,13 +138,13 @@ def test_the_page_has_every_column():
     assert [column for column in COLUMNS if column not in whole and not column.startswith(tuple(begun))] == []
 
 
-def test_rows_of_a_table_with_other_columns_are_not_taken(monkeypatch):
+def test_rows_of_a_table_with_other_columns_are_rejected(monkeypatch):
     before = row_key("aa", FleetSettings())
     monkeypatch.setitem(COLUMNS, "another_s", float)
     assert row_key("aa", FleetSettings()) != before
 
 
-def test_what_a_result_hangs_on():
+def test_dependencies_of_a_result():
     keys = {row_key("aa", FleetSettings()), row_key("ab", FleetSettings()), row_key("aa", FleetSettings(model="rigid")),
             row_key("aa", FleetSettings(confidence=0.9)), row_key("aa", FleetSettings(tolerance=0.9))}
     assert len(keys) == 5
@@ -153,7 +153,7 @@ def test_what_a_result_hangs_on():
 @pytest.mark.parametrize("change", [
     {"other": 1}, {"inertia_kg_m2": "104"}, {"samples": 1.5}, {"complete": 1}, {"verdict": None},
 ])
-def test_what_is_no_row(change):
+def test_invalid_rows(change):
     content = asdict(FleetRow("a", "valid")) | change
     if change == {"verdict": None}:
         del content["verdict"]
@@ -167,7 +167,7 @@ def test_what_is_no_row(change):
     ({"verdict": "model_rejected", "inertia_kg_m2": None}, True), ({"verdict": 7}, None), ("what", None),
     ({"verdict": "valid", "inertia_kg_m2": {"value": "x"}}, True),
 ])
-def test_what_changed_against_the_log_s_own_result(stored, changed):
+def test_changes_from_the_result_in_the_log(stored, changed):
     document = {"verdict": "valid", "reason": "as", "inertia_kg_m2": {"value": 104.0, "low": 103.0}}
     row = row_of("a.mcap", json.loads(json.dumps(document)), settings=FleetSettings(), stored=stored)
     assert row.changed is changed
@@ -179,12 +179,12 @@ FORMULAS = ("=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "\
 
 @pytest.mark.parametrize("name", [*FORMULAS, "'quoted", "R7", "a=b", "5-6"])
 def test_no_text_of_a_table_is_a_formula_and_it_is_read_back_as_it_was(tmp_path, name):
-    """A rig's name comes from a log, and so from anybody."""
+    """The name of a rig comes from a log, which anyone may have written."""
     row = FleetRow(log=name, verdict="valid", rig=name, note=name, operator=name, skew_s=-0.5)
     write_table([row], tmp_path / "fleet.csv")
     with (tmp_path / "fleet.csv").open(newline="", encoding="utf-8") as file:
         (cells,) = csv.DictReader(file)
     texts = {cells[column] for column in ("log", "rig", "note", "operator")}
     assert texts == {f"'{name}" if name in FORMULAS else name}
-    assert cells["skew_s"] == "-0.5"                       # a number stays one
+    assert cells["skew_s"] == "-0.5"                       # a number stays a number
     assert read_table(tmp_path / "fleet.csv") == [row]

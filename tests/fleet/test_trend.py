@@ -38,7 +38,7 @@ def table(tmp_path):
     return tmp_path / "fleet.csv"
 
 
-def test_a_step_is_named_with_its_place_and_size():
+def test_a_step_is_reported_with_its_place_and_size():
     found, at = rows("step 5 %")
     document = trend_document(found[::-1], "R7")
     inertia, lag = document["quantities"][0], document["quantities"][3]
@@ -56,7 +56,7 @@ def test_a_step_is_named_with_its_place_and_size():
 
 
 def test_a_rehearsed_fault_is_no_history():
-    """A torque scale of 1.1, rehearsed on the simulated drive, once was a change of J with over 99.9 % probability."""
+    """A rehearsed torque scale of 1.1 used to be reported as a change of J with more than 99.9 % probability."""
     found, _ = rows("none")
     rehearsed = [
         replace(one, log=f"fault-{one.log}", rehearsed_faults="torque-scale=1.1",
@@ -70,7 +70,7 @@ def test_a_rehearsed_fault_is_no_history():
 
 
 def test_a_result_from_a_part_of_a_run_is_no_history():
-    """Six runs that a fault ended gave a result 10 % higher: once the rig had changed by 10 % for that."""
+    """Six runs that a fault ended give a result 10 % higher. It used to be reported as a change of the rig."""
     found, _ = rows("none")
     ends = {"aborted_stage": "acquire", "aborted_by": "DriveFault"}
     parts = [replace(one, log=f"part-{one.log}", **({"complete": False} if k == 5 else ends),
@@ -87,7 +87,7 @@ def test_a_result_from_a_part_of_a_run_is_no_history():
 
 
 def test_a_trend_loads_only_what_it_needs():
-    """A page of the service waits for it. The estimation was loaded for one quantile, which took most of that time."""
+    """A page of the service waits for it. It used to load the estimation for one quantile, which was slow."""
     script = """
 import sys
 from tdhil.fleet import FleetRow, trend_document
@@ -102,7 +102,7 @@ print([one for one in ("tdhil.estimation", "tdhil.fleet.task", "pydantic", "nump
 
 
 def test_logs_of_two_drives_are_never_one_series():
-    """Two benches of one name, J 104 and 140: once they were one rig that had changed by 35 %."""
+    """Two benches with one name and J 104 and 140 used to be reported as one rig with a change of 35 %."""
     found, _ = rows("none")
     other = [replace(one, date=f"2025{one.date[4:]}", drive_serial=9, inertia_kg_m2=1.35 * one.inertia_kg_m2,
                      inertia_low_kg_m2=1.35 * one.inertia_low_kg_m2, inertia_high_kg_m2=1.35 * one.inertia_high_kg_m2)
@@ -115,11 +115,11 @@ def test_logs_of_two_drives_are_never_one_series():
     assert profiles["quantities"] == document["quantities"]
     same_drive = trend_document([*found, *(replace(one, drive_serial=found[0].drive_serial, profile="other")
                                            for one in other)], "R7")
-    assert same_drive["quantities"] == document["quantities"]      # another profile reads another torque
+    assert same_drive["quantities"] == document["quantities"]      # another profile has another torque signal
 
 
 def test_inertias_of_different_bodies_are_never_one_series():
-    """A rigid shaft gives motor and load, a compliant one J_r: half of each is no step of J."""
+    """A rigid shaft gives J of motor and load, a compliant one J_r. A mixture of both is no step of J."""
     found, _ = rows("none")
     mixed = [replace(one, inertia_scope="motor_and_load" if k < 12 else "motor_side",
                      inertia_kg_m2=one.inertia_kg_m2 * (1.0 if k < 12 else 0.8),
@@ -146,12 +146,12 @@ def test_the_interval_of_a_change_is_rounded_outwards():
 
 
 def test_a_rig_without_a_name_is_known_by_no_file_name():
-    """Every folder may have its rig.yaml: two of them are not one rig."""
+    """Every folder may have its own rig.yaml. Two of them are not the same rig."""
     document = {"verdict": "valid", "reason": "", "rig": {"name": None, "file": "rig.yaml"}}
     assert row_of("run.mcap", document, settings=FleetSettings()).rig is None
 
 
-def test_what_was_left_out_and_assumed_is_said():
+def test_omissions_and_assumptions_are_stated():
     found, _ = rows("drift 5 %", serial=0)
     odd = [replace(found[0], verdict="model_rejected"), replace(found[1], date=None), replace(found[2], simulated=True)]
     document = trend_document([*odd, *found[3:]], "R7")
@@ -173,7 +173,7 @@ def test_what_was_left_out_and_assumed_is_said():
 
 @pytest.mark.parametrize("serial", [0, 7])
 def test_simulated_and_real_runs_are_never_one_series(serial):
-    """Same name, drive and profile: four simulated runs of J 104 and four real ones of J 140 are no change."""
+    """With the same name, drive and profile, four simulated runs of J 104 and four real ones of J 140 are no change."""
     found, _ = rows("none", count=8, serial=serial)
     mixed = [replace(one, simulated=k < 4, inertia_kg_m2=one.inertia_kg_m2 * (1.0 if k < 4 else 1.35),
                      inertia_low_kg_m2=one.inertia_low_kg_m2 * (1.0 if k < 4 else 1.35),
@@ -185,7 +185,7 @@ def test_simulated_and_real_runs_are_never_one_series(serial):
 
 
 def test_runs_before_and_after_a_calibration_are_kept_apart():
-    """A calibration moves J by 5 %: the torque scale of each side is in the difference, and no shaft has changed."""
+    """A calibration changes J by 5 %. The torque scale of each side is in the difference, and no shaft has changed."""
     found, _ = rows("none")
     half = len(found) // 2
     day = "2026-01-12T10:00:00+00:00"
@@ -205,8 +205,8 @@ def test_runs_before_and_after_a_calibration_are_kept_apart():
     assert scale_of(after[0]) != scale_of(found[0]) == scale_of(plain[0])
 
 
-def test_dates_of_a_trend_s_picture_can_be_read(tmp_path):
-    """On an axis of time, under the last of the pictures alone, and no two over each other."""
+def test_dates_of_the_picture_of_a_trend_are_legible(tmp_path):
+    """They are on the time axis below the last picture only, and do not overlap."""
     from matplotlib.figure import Figure
 
     from tdhil.cli.trend import _draw_trend
@@ -252,7 +252,7 @@ def test_the_command_trend(table, tmp_path, capsys):
 @pytest.mark.heavy
 @pytest.mark.one_worker("fleet")
 def test_the_command_compare(few, tmp_path, capsys):
-    """Two runs of one rig, of which the truth is alike."""
+    """The command compares two runs of one rig with the same true values."""
     report = tmp_path / "compared.html"
     logs = [str(few / "R1-001.mcap"), str(few / "R1-002.mcap")]
     assert main(["compare", *logs, "--report", str(report), "--json"]) == 0

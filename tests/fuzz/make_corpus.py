@@ -1,4 +1,4 @@
-"""Writes the valid files of the corpus anew: python tests/fuzz/make_corpus.py. What was found by fuzzing stays."""
+"""Write the valid files of the corpus again: python tests/fuzz/make_corpus.py. Files found by fuzzing are kept."""
 
 import random
 import struct
@@ -39,7 +39,7 @@ def traces() -> dict[str, bytes]:
 
 
 def can_scripts() -> dict[str, bytes]:
-    """after, kind, identifier, length, data."""
+    """Return records of after, kind, identifier, length, data."""
     record = struct.Struct("<BBBB8s").pack
     return {
         "nothing": b"",

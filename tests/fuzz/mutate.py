@@ -1,7 +1,7 @@
-"""Inputs made from valid ones: flips, cuts, splices, and changes that know what kind of file it is. Seeded.
+"""Seeded inputs made from valid ones: flips, cuts, splices, and changes specific to the kind of file.
 
-A mutation of plain bytes rarely gets past a checksum or a scanner. So text is changed by lines, keys and values too,
-and an MCAP file by the messages inside its chunks, with lengths and checksums made right again.
+A mutation of plain bytes rarely passes a checksum or a scanner. So text is changed by lines, keys and values too,
+and an MCAP file by the messages inside its chunks, with corrected lengths and checksums.
 """
 
 import random
@@ -85,7 +85,7 @@ def number(data: bytearray, rng: random.Random, others: Sequence[bytes]) -> byte
 
 
 def tokens(words: Sequence[bytes]) -> Mutation:
-    """Puts one of ``words`` somewhere, or in the place of some other word."""
+    """Insert one of ``words``, or replace another word by it."""
     def put(data: bytearray, rng: random.Random, others: Sequence[bytes]) -> bytes:
         found = list(re.finditer(rb"[\w./%-]+", data))
         word = rng.choice(words)
@@ -101,7 +101,7 @@ _CHUNK_HEAD = struct.Struct("<BQQQQII4sQ")
 
 
 def inside_chunks(data: bytearray, rng: random.Random, others: Sequence[bytes]) -> bytes:
-    """Changes the contents of one chunk of an MCAP file and packs it again, as a hostile writer would."""
+    """Change the contents of one chunk of an MCAP file and pack it again, like a hostile writer."""
     places = [match.start() - 37 for match in re.finditer(rb"\x04\0\0\0zstd", data) if match.start() >= 37]
     if not places:
         return flip(data, rng, others)
@@ -122,7 +122,7 @@ def inside_chunks(data: bytearray, rng: random.Random, others: Sequence[bytes]) 
 
 
 def records(data: bytearray, rng: random.Random, others: Sequence[bytes]) -> bytes:
-    """More of what `replies.Script` understands: records of 12 bytes, near each other or far apart."""
+    """Add records of 12 bytes for `replies.Script`, near each other or far apart."""
     found = [bytes(data[start:start + 12]) for start in range(0, len(data), 12)]
     apart = rng.choice((0, 3, 30, 255))
     for _ in range(rng.choice((1, 3, 10, 40))):
@@ -137,7 +137,7 @@ BYTES: tuple[Mutation, ...] = (flip, overwrite, cut, remove, repeat, splice)
 
 
 def mutated(rng: random.Random, corpus: Sequence[bytes], known: Sequence[Mutation]) -> bytes:
-    """One to five mutations of one file of the corpus."""
+    """Apply one to five mutations to one file of the corpus."""
     data = rng.choice(corpus)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 5))):
         data = rng.choice(known)(bytearray(data), rng, corpus)[:LARGEST]

@@ -1,6 +1,6 @@
-"""Every parser that takes bytes from outside, with its corpus, its mutations and the one thing it may raise.
+"""Every parser of external bytes, with its corpus, its mutations and its only allowed exception.
 
-An input passes when the parser gives something or raises a `TdhilError` that names the place, one line a problem.
+An input passes if the parser returns a result, or raises a `TdhilError` with one line and place per problem.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ EDS_WORDS = [b"[", b"]", b"=", b";", b"#", b"0x", b"$NODEID+", b"[6060]", b"[101
 
 @dataclass(frozen=True)
 class Parser:
-    """``parse`` reads the file at a path and checks what it gives; ``mutations`` know what kind of file it is."""
+    """Parser. ``parse`` reads the file at a path and checks the result; ``mutations`` are those of its kind of file."""
 
     name: str
     suffix: str
@@ -44,12 +44,12 @@ class Parser:
         return CORPUS / self.name
 
     def corpus(self) -> list[bytes]:
-        """Valid files first, then everything that was ever found."""
+        """Return the corpus: valid files first, then all files found by fuzzing."""
         return [path.read_bytes() for path in sorted(self.folder.iterdir())]
 
 
 def try_one(parser: Parser, data: bytes, path: Path) -> str:
-    """'taken' or 'refused'. Anything but a proper refusal goes through as what it is."""
+    """Return 'taken' or 'refused'. Any exception other than a proper refusal is raised."""
     path.write_bytes(data)
     try:
         parser.parse(path)
@@ -60,7 +60,7 @@ def try_one(parser: Parser, data: bytes, path: Path) -> str:
 
 
 def check_refusal(error: TdhilError, path: Path) -> None:
-    """One line a problem, each with its place; no line goes on for ever."""
+    """Check that a refusal has one line of bounded length per problem, each with its place."""
     said = str(error)
     problems = getattr(error, "problems", None)
     assert said.count("\n") < (len(problems) if problems else 1), f"more lines than problems: {said!r}"
@@ -71,7 +71,7 @@ def check_refusal(error: TdhilError, path: Path) -> None:
 
 
 def parser_free(said: str) -> bool:
-    """Errors below a bus name an object, a node or the host in ``where``; these words do so in the text."""
+    """Run a parser below a bus. Its errors name an object, a node or the host in ``where``, or in the text."""
     return any(word in said for word in ("node", "bus", "drive", "request"))
 
 
@@ -147,7 +147,7 @@ def _mcap(path: Path) -> None:
     from tests.recording.log_runs import same_run
 
     copy = path.with_suffix(".copy")
-    found = examine(path)                  # as `tdhil recover`: also where the head is damaged
+    found = examine(path)                  # like `tdhil recover`: with a damaged head too
     write_copy(path, copy, found)
     again = read_run(copy)
     assert again.complete == found.whole

@@ -1,8 +1,8 @@
-"""Hostile replies: what a drive, or whoever else is on the bus, may say to the drivers. Scripts are bytes.
+"""Hostile replies of a drive or another node to the drivers. Scripts are bytes.
 
-CAN: records of 12 bytes, ``after u8, kind u8, identifier u8, length u8, data 8``. After so many more frames of the
-host's own, the record acts: a foreign frame is put on the bus, or an answer is changed, dropped or said twice.
-Modbus: ``request u8, cut u8`` and the bytes that the line then says.
+CAN: records of 12 bytes, ``after u8, kind u8, identifier u8, length u8, data 8``. A record acts after this number of
+host frames: it sends a foreign frame, or changes, drops or duplicates a reply.
+Modbus: ``request u8, cut u8`` and the bytes on the line.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ _profile = load_canopen_profile("generic/cia402")
 
 
 class Script:
-    """Reads its records one after the other, each when its time has come."""
+    """Script whose records act one after the other, each at its time."""
 
     def __init__(self, data: bytes, bus: ScriptedBus) -> None:
         self._records = [data[start:start + 12].ljust(12, b"\0") for start in range(0, len(data), 12)]
@@ -59,7 +59,7 @@ class Script:
         elif kind % 8 == 7:
             for _, message in answers:
                 del message.data[length:]
-        else:                              # other values, behind an answer's own head or one of the script's
+        else:                              # other values, after the header of the reply or of the script
             for _, message in answers:
                 head = 4 if kind % 8 == 5 else 0
                 message.data[head:] = bytes(one ^ data[k] for k, one in enumerate(message.data) if k >= head)
@@ -79,7 +79,7 @@ def fake_time() -> Iterator[FakeTime]:
 
 
 def can_session(script: bytes) -> None:
-    """A whole life of the driver against a drive that lies. Raises the first TdhilError, after the stop."""
+    """Run a whole driver session with a hostile drive. Raise the first TdhilError after the stop."""
     first: TdhilError | None = None
 
     def attempt(step: Any, *arguments: Any) -> Any:
@@ -111,7 +111,7 @@ def can_session(script: bytes) -> None:
         left = drive.close()
         assert bus.closed
         assert all("\n" not in line for line in left)
-        assert now.now_s - begun_s < 600.0, "it took ten minutes of fake time"
+        assert now.now_s - begun_s < 600.0, "it took more than ten minutes of fake time"
     if first is not None:
         raise first
 
@@ -120,7 +120,7 @@ def can_session(script: bytes) -> None:
 
 
 class Port:
-    """Quacks like pyserial's Serial. What it says is there at once; then time goes by."""
+    """Port with the interface of pyserial's Serial. Its bytes are available at once; then time passes."""
 
     def __init__(self, said: bytes, clock: "TickingClock") -> None:
         self._said, self._clock = said, clock
@@ -147,7 +147,7 @@ class Port:
 
 
 class TickingClock:
-    """Every look at it takes a microsecond, so that no loop stands still."""
+    """Clock that advances by a microsecond with each reading, so that no loop is endless."""
 
     stepped = False
 
@@ -171,7 +171,7 @@ def modbus_requests() -> tuple[bytes, ...]:
 
 
 def modbus_replies(script: bytes) -> None:
-    """One request over each of the two links, answered by the script. Raises the last TdhilError."""
+    """Send one request over each link, with replies of the script. Raise the last TdhilError."""
     from drivers.modbus import pdu
 
     known = modbus_requests()
@@ -188,7 +188,7 @@ def modbus_replies(script: bytes) -> None:
         except TdhilError as error:
             assert str(error).strip() and "\n" not in str(error), repr(str(error))
             errors.append(error)
-    if len(errors) == 3:                   # no way of hearing it makes a reply of it
+    if len(errors) == 3:                   # it is no valid reply on any line
         raise errors[-1]
 
 
@@ -196,7 +196,7 @@ def _over_rtu(request: bytes, said: bytes, framed: bool) -> tuple[int, ...]:
     from drivers.modbus import pdu, rtu
 
     clock = TickingClock()
-    if framed:                             # what is inside a frame that is sound
+    if framed:                             # content of a valid frame
         body = b"\x01" + said[:250]
         said = body + rtu.FramerRTU.compute_CRC(body).to_bytes(2, "big")
     fake = types.ModuleType("serial")

@@ -86,7 +86,7 @@ def test_any_reply_on_modbus(tmp_path, script):
 @pytest.mark.parametrize("name", YAML)
 @pytest.mark.parametrize("tag", ["!!python/object/apply:pathlib.Path.touch", "!!python/object/new:os.system",
                                  "!!python/name:os.system", "!!python/module:os", "!touch"])
-def test_no_code_comes_from_data(name, tag, tmp_path):
+def test_data_contain_no_executed_code(name, tag, tmp_path):
     path, marker = tmp_path / "input.yaml", tmp_path / "marker"
     path.write_text(f"study: {tag} [touch {marker}]\nbus: {tag} ['{marker}']\n{tag} a: 1\n")
     with pytest.raises(TdhilError) as error:
@@ -116,8 +116,8 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
 @pytest.mark.heavy
-def test_text_that_grows_or_nests_takes_little_memory(tmp_path):
-    """Aliases that double at each level, brackets without end, files that are merely large. All YAML is read alike."""
+def test_growing_or_nested_text_needs_little_memory(tmp_path):
+    """The inputs have doubling aliases, endless brackets, or large size. All YAML is read by one loader."""
     done = subprocess.run([sys.executable, "-c", GROWING, tmp_path / "rig.yaml"], capture_output=True, text=True,
                           cwd=ROOT, timeout=600)
     assert done.returncode == 0, done.stderr
@@ -127,7 +127,7 @@ def test_text_that_grows_or_nests_takes_little_memory(tmp_path):
     assert grown_kb < 100_000
 
 
-def test_the_harness_finds_what_it_looks_for(tmp_path):
+def test_the_harness_finds_faults(tmp_path):
     def wrong(path):
         raise ValueError("a mistake of ours")
 

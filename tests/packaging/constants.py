@@ -1,4 +1,4 @@
-"""Module-level numeric constants that state neither their meaning nor their source.
+"""Module-level numeric constants without a statement of their meaning or source.
 
 ``python -m tests.packaging.constants FOLDER`` lists them. A constant states it by a docstring below, or by a comment on
 its line; a directive to a tool is no comment. Several names in one statement share both.
@@ -20,7 +20,7 @@ _DIRECTIVE = re.compile(r"\s*(?:noqa|type:|pragma:|ruff:)")
 
 @dataclass(frozen=True)
 class Bare:
-    """A statement that binds numbers without a word."""
+    """Statement that binds numbers without an explanation."""
 
     path: Path
     line: int
@@ -31,7 +31,7 @@ class Bare:
 
 
 def numeric(node: ast.expr | None) -> bool:
-    """Return whether an expression holds numbers only: literals, signs, sums, and tuples, lists or sets of them."""
+    """Return whether an expression contains numbers only: literals, signs, sums, and tuples, lists or sets of them."""
     if isinstance(node, ast.Constant):
         return isinstance(node.value, int | float) and not isinstance(node.value, bool)
     if isinstance(node, ast.UnaryOp):
@@ -60,7 +60,7 @@ def bare_constants(path: Path) -> Iterator[Bare]:
 
 
 def in_folder(folder: Path) -> list[Bare]:
-    """Return those of every module below a folder."""
+    """Return the constants of every module below a folder."""
     return [one for path in sorted(folder.rglob("*.py")) for one in bare_constants(path)]
 
 

@@ -1,6 +1,6 @@
-"""What in the texts of the tree is not plain: openings of docstrings, words, and long sentences.
+"""Texts of the tree that are not plain: openings of docstrings, words, and long sentences.
 
-``python -m tests.packaging.language`` lists all findings; with a folder behind it, those of that folder.
+``python -m tests.packaging.language`` lists all findings; with a folder as argument, those of that folder.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 MOST_WORDS = 30
-"""In a sentence of a page or a message."""
+"""Limit of words in a sentence of a page or a message."""
 
 OPENINGS = frozenset((
     "As", "At", "By", "Does", "From", "Has", "Here", "In", "Is", "May", "No", "None", "Not", "Of", "So", "There",
     "What", "Whatever", "Where", "Whether", "Who", "Whoever", "Whose",
 ))
-"""First words of a docstring that is a fragment: it begins with a verb in the imperative or with a noun phrase."""
+"""First words of fragments. A docstring begins with a verb in the imperative or with a noun phrase."""
 
 WORDS = {
     r"\b(he|his|him|she|her|whoever|whatever else|somebody|nobody)\b": "name the operator, the drive or the master",
@@ -39,7 +39,7 @@ EXCEPTIONS = {
     "tdhil/report/document.py": "second_opinions is a key of the JSON document",
     "tests/packaging/language.py": "this list",
 }
-"""Files whose words are not looked at, each with its reason."""
+"""Files whose words are not checked, each with its reason."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Finding:
 
     @property
     def room(self) -> str:
-        """The part of the tree that has a ceiling of its own."""
+        """Part of the tree with its own ceiling."""
         parts = self.path.split("/")
         if parts[0] in ("tdhil", "docs") and len(parts) > 2:
             return "/".join(parts[:2])
@@ -61,7 +61,7 @@ class Finding:
 
 
 def findings() -> Iterator[Finding]:
-    """All findings of the tree."""
+    """Yield all findings of the tree."""
     for room in ROOMS:
         for path in sorted((ROOT / room).rglob("*.py")):
             yield from of_code(path)
@@ -70,7 +70,7 @@ def findings() -> Iterator[Finding]:
 
 
 def of_code(path: Path) -> Iterator[Finding]:
-    """Docstrings, comments and messages of a module."""
+    """Yield the findings in docstrings, comments and messages of a module."""
     name, source = str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")
     tree = ast.parse(source)
     docstrings = set()
@@ -85,7 +85,7 @@ def of_code(path: Path) -> Iterator[Finding]:
                 if of_a_definition and first and first[1] in OPENINGS:
                     yield Finding(name, one.lineno, "opening", one.value.value.strip().partition("\n")[0])
                 yield from _words(name, one.lineno, one.value.value)
-    if any("#" in row and _ANY_WORD.search(row) for row in source.splitlines()):      # to tokenise takes long
+    if any("#" in row and _ANY_WORD.search(row) for row in source.splitlines()):      # tokenising is slow
         for token in tokenize.generate_tokens(io.StringIO(source).readline):
             if token.type == tokenize.COMMENT:
                 yield from _words(name, token.start[0], token.string)
@@ -105,7 +105,7 @@ def _message(node: ast.AST) -> str | None:
 
 
 def of_page(path: Path) -> Iterator[Finding]:
-    """Prose of a Markdown page: no fenced block, and a code span counts as one word."""
+    """Yield the findings in the prose of a Markdown page, without fenced blocks; a code span counts as one word."""
     name = str(path.relative_to(ROOT))
     for line, paragraph in paragraphs(path.read_text(encoding="utf-8")):
         text = re.sub(r"`[^`]*`", "code", re.sub(r"\]\([^)]*\)", "]", paragraph))
@@ -115,7 +115,7 @@ def of_page(path: Path) -> Iterator[Finding]:
 
 
 def paragraphs(text: str) -> Iterator[tuple[int, str]]:
-    """Paragraphs, list items and rows of tables, each with its first line."""
+    """Yield paragraphs, list items and rows of tables, each with its first line."""
     kept: list[str] = []
     begun, fenced = 1, False
     for number, row in enumerate([*text.splitlines(), ""], 1):
@@ -147,7 +147,7 @@ def _long(name: str, line: int, text: str) -> Iterator[Finding]:
 
 
 def counted() -> Counter[tuple[str, str]]:
-    """Findings by room and kind."""
+    """Return the number of findings by room and kind."""
     return Counter((one.room, one.kind) for one in findings())
 
 

@@ -1,6 +1,6 @@
-"""One name, one thing: no two classes of the source have the same name, but for those that mean the same.
+"""Unique class names: no two classes of the source have the same name, except for those with the same meaning.
 
-A leading underscore does not make another name: ``_Point`` beside ``Point`` is met by the same search.
+A leading underscore does not make a different name: a search finds both ``_Point`` and ``Point``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 
-# Names of several classes, where these stand, and why one name is right.
+# Names of several classes, their places, and the reason for one name.
 SHARED = {
     "Check": ({"drivers/drive.py", "tdhil/service/run_state.py"},
               "one line of the preflight table: as the driver makes it, and as the service's document names it"),

@@ -11,7 +11,7 @@ from tests.packaging.constants import ROOT, bare_constants, in_folder
 
 FOLDERS = ("tdhil/estimation", "tdhil/runner")
 
-def test_no_number_is_without_a_word():
+def test_no_number_is_without_an_explanation():
     assert [str(one) for folder in FOLDERS for one in in_folder(ROOT / folder)] == []
 
 
@@ -21,7 +21,7 @@ def test_no_number_is_without_a_word():
     ("A = True\nB = 'x'\nC = f(1)\n", []), ("A: float = 2 * 3.0\n", ["A"]),
     ("A = 1.0  # noqa: PLR2004\n", ["A"]), ("A = 1.0  # noqa: PLR2004  # s\n", []), ("A = 1.0  #\n", ["A"]),
 ])
-def test_what_counts_as_a_number_without_a_word(tmp_path, source, names):
+def test_rule_for_numbers_without_an_explanation(tmp_path, source, names):
     path = tmp_path / "module.py"
     path.write_text(source)
     assert [one.names for one in bare_constants(path)] == names

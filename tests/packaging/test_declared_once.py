@@ -1,4 +1,4 @@
-"""A constant of one room is declared once: two declarations of one rule drift apart."""
+"""Each constant of a room is declared once, since two declarations of one rule would diverge."""
 
 import ast
 from collections import defaultdict
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS = ("drivers", "profiles", "sim_bus", *sorted(
     f"tdhil/{one.name}" for one in (ROOT / "tdhil").iterdir() if (one / "__init__.py").exists()))
 TYPES = ("TypeVar(", "NDArray[", "Callable[", "Mapping[", "Annotated[", "Literal[")
-"""Values that are types: they are no limit and no rule."""
+"""Values that are types, and therefore no limits or rules."""
 
 CHANCE: Mapping[str, str] = {
     "drivers WINDOW_S": "of a wall clock's offset, and of a position at standstill",
@@ -32,7 +32,7 @@ CHANCE: Mapping[str, str] = {
 
 
 def declarations(room: str) -> Iterator[tuple[str, str, str]]:
-    """Yield name, value and place of each constant of a module in a room."""
+    """Yield name, value and place of each constant in the modules of a room."""
     for path in sorted((ROOT / room).rglob("*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
@@ -51,4 +51,4 @@ def test_a_constant_is_declared_once_in_its_room(room):
     twice = {name: where for (name, _), where in places.items() if len(where) > 1}
     known = {one.split()[1] for one in CHANCE if one.split()[0] == room}
     assert {name: where for name, where in twice.items() if name not in known} == {}
-    assert known <= set(twice), "the table lists a name that stands once"
+    assert known <= set(twice), "the table lists a name that is declared once"

@@ -1,4 +1,4 @@
-"""Examples load, are complete, and the page on rig.yaml knows every key."""
+"""Examples: they load and are complete, and the page on rig.yaml has every key."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PLANT = ROOT / "examples" / "plant.yaml"
 
 
 def keys(model: type[BaseModel], prefix: str = "") -> dict[str, Any]:
-    """Dotted key → default, `PydanticUndefined` where the key is required."""
+    """Return dotted key → default; `PydanticUndefined` if the key is required."""
     found: dict[str, Any] = {}
     for name, field in model.model_fields.items():
         key = prefix + (field.alias or name)
@@ -109,7 +109,7 @@ def test_page_has_every_key_and_no_other():
 
 
 @pytest.mark.parametrize("key", sorted(keys(rig_model())))
-def test_page_says_the_true_default(key):
+def test_page_states_the_true_default(key):
     default = keys(rig_model())[key]
     shown = rows()[key][0]
     built_in = next((option.default for option in OPTIONS if option.at == key), None)

@@ -1,4 +1,4 @@
-"""The figures of the pages are what their code draws."""
+"""Figures of the pages: they agree with the output of their code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tdhil.report import GRAPHS
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "figures"
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
-PIXELS = 1.0                      # of the figure: another processor's linear algebra rounds otherwise
+PIXELS = 1.0                      # tolerance in the figure: the linear algebra of another processor rounds differently
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def figures():
 
 
 def script(name: str):
-    """The module of a script in docs/figures."""
+    """Return the module of a script in docs/figures."""
     sys.path.insert(0, str(FOLDER))
     try:
         spec = importlib.util.spec_from_file_location(f"{name}_of_the_pages", FOLDER / f"{name}.py")
@@ -43,7 +43,7 @@ def script(name: str):
 
 
 def same(drawn: str, kept: str) -> bool:
-    """Same elements and same words; coordinates within a pixel."""
+    """Return whether elements and words are the same, and coordinates agree within a pixel."""
     if NUMBER.sub("#", drawn) != NUMBER.sub("#", kept):
         return False
     pairs = zip(NUMBER.findall(drawn), NUMBER.findall(kept), strict=True)
@@ -67,7 +67,7 @@ def test_figure_from_a_run(figures, name):
 
 
 OF_ANOTHER_RUN = "graph_lines_bad"
-"""Drawn from a run of a shaft with two masses, whose fits take half a minute."""
+"""Graphs from a run of a shaft with two masses, whose fits take half a minute."""
 
 
 @pytest.mark.one_worker("figures")
@@ -75,7 +75,7 @@ OF_ANOTHER_RUN = "graph_lines_bad"
     pytest.param("the run", marks=pytest.mark.heavy), pytest.param("another run", marks=pytest.mark.long),
 ])
 def test_graphs_of_the_report_have_the_words_of_the_pictures(figures, whose):
-    """Another version of matplotlib draws its curves otherwise; the words and ticks stay."""
+    """Another version of matplotlib draws curves differently. Words and ticks are the same."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
     for name in figures.GRAPHS:
         if (name == OF_ANOTHER_RUN) is (whose == "the run"):
@@ -109,7 +109,7 @@ def test_pictures_of_the_frequency_response_have_the_words_of_the_pictures(name)
 
 @pytest.fixture(scope="module")
 def graphs():
-    """The script of the good and bad graphs."""
+    """Return the script of the good and bad graphs."""
     return script("graphs")
 
 
@@ -160,7 +160,7 @@ def test_each_graph_has_a_section_with_an_example_and_what_to_do():
 
 
 def test_each_row_of_the_table_of_graphs_is_shown_somewhere():
-    """`Picture` refuses an unknown name when its caption is read; a name that no code has would be a dead row."""
+    """`Picture` refuses an unknown name when its caption is read. A name that no code uses would be an unused row."""
     patterns = ("report/*.py", "cli/trend.py", "service/templates/*.html")
     places = [path.read_text(encoding="utf-8") for pattern in patterns for path in (ROOT / "tdhil").glob(pattern)
               if path.name != "graphs.py"]
@@ -193,7 +193,7 @@ def test_every_figure_is_tried_here(figures):
     assert set(figures.RUN) == {"five_stages", "uncertainty_budget"}
 
 
-def test_a_line_that_moved_is_seen():
+def test_a_moved_line_is_found():
     assert same("<a x='1.0'/>", "<a x='1.4'/>")
     assert not same("<a x='1.0'/>", "<a x='3.0'/>")
     assert not same("<a x='1.0'>J</a>", "<a x='1.0'>K</a>")

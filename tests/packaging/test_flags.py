@@ -44,5 +44,5 @@ def test_every_flag_that_a_text_names_is_declared():
     ("add --accept-wider-limit speed", ["--accept-wider-limit"]), ("`--yes`.", ["--yes"]), ("--motion-{name}", []),
     ("the run --accept-… takes", []), ("a -- b, x--y, ---", []),
 ])
-def test_what_counts_as_a_flag(text, flags):
+def test_rule_for_flags(text, flags):
     assert FLAG.findall(text) == flags

@@ -1,4 +1,4 @@
-"""The drawing of the house is true, starting is cheap, and nothing of one machine stands in the tree."""
+"""Architecture: import contracts hold, the start is fast, and the tree contains no paths of one computer."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_help_imports_nothing_heavy():
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("command", ["identify", "replay", "profiles", "scan", "doctor", "simulate"])
-def test_help_of_a_command_comes_quickly(command):
+def test_help_of_a_command_is_quick(command):
     done = run("-X", "importtime", "-m", "tdhil", command, "--help")
     assert done.returncode == 0
     imported = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
@@ -69,7 +69,7 @@ def test_help_of_a_command_comes_quickly(command):
     assert imported.isdisjoint({"scipy", "canopen", "mcap", "matplotlib"})
 
 
-def test_what_a_log_says_of_its_run_is_read_without_a_virtual_string():
+def test_the_data_of_a_run_in_a_log_are_read_without_the_virtual_string():
     done = run("-c", "import sys\nfrom tdhil.runner import precondition_warnings, speed_warnings, stage_warnings\n"
                      "print([name for name in sys.modules if name.startswith('tdhil.soft_torque.')])")
     assert done.stdout == "[]\n", done.stderr
@@ -93,7 +93,7 @@ def test_identify_needs_no_service_fleet_or_tuning(tmp_path):
     assert (house / "report.html").is_file()
 
 
-def test_no_path_of_a_home_stands_in_the_tree():
+def test_no_home_path_is_in_the_tree():
     found = []
     for folder, folders, names in os.walk(ROOT):
         folders[:] = [name for name in folders

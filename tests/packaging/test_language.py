@@ -1,7 +1,7 @@
-"""The texts of the tree are plain: openings of docstrings, words, sentences of at most 30 words, links that resolve.
+"""Plain texts of the tree: openings of docstrings, words, sentences of at most 30 words, links that resolve.
 
-`tests/packaging/language.py` has the rules, and lists what it finds when it is run. The tree does not follow them
-everywhere yet, so each room has a ceiling for what is left. A ceiling is lowered when a room is reworded, never raised.
+`tests/packaging/language.py` has the rules, and lists its findings when it is run. The tree does not follow them
+everywhere yet, so each room has a ceiling for the rest. A ceiling is lowered when a room is reworded, never raised.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def test_no_room_gets_less_plain(counts):
 
 @pytest.mark.parametrize("room", ["tdhil", "drivers", "sim_bus", "profiles"])
 def test_a_percentage_has_a_space_before_its_sign(room):
-    """As the SI brochure (5.4.7) writes it. The format ``{share:.1%}`` prints none; ``{100 * share:.1f} %`` does."""
+    """The SI brochure (5.4.7) requires it. The format ``{share:.1%}`` prints no space; ``{100 * share:.1f} %`` does."""
     for path in sorted((ROOT / room).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FormattedValue) and isinstance(node.format_spec, ast.JoinedStr):
@@ -56,7 +56,7 @@ def test_the_exceptions_are_few_and_exist():
     assert [name for name, reason in EXCEPTIONS.items() if not (ROOT / name).is_file() or not reason] == []
 
 
-def test_the_rules_find_what_they_are_for(tmp_path, monkeypatch):
+def test_the_rules_find_their_cases(tmp_path, monkeypatch):
     monkeypatch.setattr("tests.packaging.language.ROOT", tmp_path)
     page = tmp_path / "docs" / "page.md"
     page.parent.mkdir()
@@ -72,7 +72,7 @@ def test_the_rules_find_what_they_are_for(tmp_path, monkeypatch):
 
 @cache
 def anchors(page: Path) -> frozenset[str]:
-    """Anchors of a page's headings, as Python-Markdown makes them."""
+    """Return the anchors of the headings of a page, in the form of Python-Markdown."""
     seen: dict[str, int] = {}
     found = set(re.findall(r'(?:id|name)="([^"]+)"', page.read_text(encoding="utf-8")))
     for _, row in paragraphs(page.read_text(encoding="utf-8")):

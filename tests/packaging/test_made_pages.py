@@ -1,4 +1,4 @@
-"""The reference pages that are made from code are what the code says today."""
+"""Reference pages that are made from code: they agree with the present code."""
 
 from __future__ import annotations
 

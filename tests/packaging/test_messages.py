@@ -1,4 +1,4 @@
-"""The table of messages: codes that are unique and stay, belong to an exit code, and have a cause and a cure."""
+"""Table of messages: permanent, unique codes, each with an exit code, a cause and a remedy."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ GOLDEN = Path(__file__).with_name("message_codes.txt")
 ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 LONGEST = 25
 EXIT_OF_THE_CALLER = {"LogError", "NothingRecorded", "ServiceError", "RunRefused"}
-"""Errors whose exit code is that of the run or of the command that met them."""
+"""Errors whose exit code is that of the run or of the command."""
 
 
-def test_codes_are_unique_and_stay():
+def test_codes_are_unique_and_permanent():
     """An entry of the golden list is never changed: scripts and manuals name it. New ones are added to the list."""
     codes = [f"{entry.code} {entry.name}" for entry in MessageCode]
     assert len({entry.number for entry in MessageCode}) == len(codes)
@@ -57,7 +57,7 @@ def _error_classes(kind=TdhilError):
 
 
 def _raised():
-    """Each call in the tree that names an entry: file and line, the class, the entry."""
+    """Yield each call in the tree that names an entry: file and line, class, entry."""
     for room in ROOMS:
         for path in sorted((ROOT / room).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
@@ -123,7 +123,7 @@ def test_explain_lists_all_and_corrects_a_mistyped_code(capsys):
 
 
 def test_the_page_is_made_from_the_code():
-    """Made anew by: tdhil explain --markdown > docs/reference/messages.md ."""
+    """The command that makes it is: tdhil explain --markdown > docs/reference/messages.md ."""
     assert (ROOT / "docs" / "reference" / "messages.md").read_text(encoding="utf-8") == page()
 
 
@@ -134,7 +134,7 @@ def test_an_error_shows_its_code_on_stderr_and_in_json(capsys):
     assert json.loads(shown.out)["error"]["code"] == "TDH-202"
 
 
-def test_what_is_no_error_of_ours_has_a_code():
+def test_other_errors_have_a_code_too():
     assert code_of(KeyboardInterrupt()) == "TDH-1300"
     assert code_of(ValueError()) == "TDH-100"
     assert code_of(OSError(28, "No space left")) == "TDH-102"

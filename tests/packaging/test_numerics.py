@@ -1,4 +1,4 @@
-"""Settings of numpy and scipy in a process of tdhil's own (`tdhil.numerics`)."""
+"""Settings of numpy and scipy in processes of tdhil (`tdhil.numerics`)."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def prepared(**variables: str) -> dict:
 
 
 @pytest.mark.heavy
-def test_what_is_not_used_is_loaded_at_its_first_use_and_works_then():
+def test_unused_parts_are_loaded_at_their_first_use_and_work_then():
     found = prepared()
     assert found["heavy"] == []
     assert found["include"].endswith("src")
@@ -42,7 +42,7 @@ def test_what_is_not_used_is_loaded_at_its_first_use_and_works_then():
 
 
 @pytest.mark.heavy
-def test_the_threads_that_the_operator_set_stay():
+def test_the_number_of_threads_set_by_the_operator_is_kept():
     assert prepared(OMP_NUM_THREADS="3")["threads"] == ONE_THREAD | {"OMP_NUM_THREADS": "3"}
 
 

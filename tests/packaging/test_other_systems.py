@@ -1,6 +1,6 @@
-"""What Windows and macOS lack is needed by nothing that is imported: only what uses it asks for it.
+"""Imports need no module that Windows or macOS lacks: such modules are imported at their use only.
 
-Tried by masking it on this system; no run on those systems is part of the tests.
+The tests mask these modules on this system. They include no run on those systems.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ print(len(first))
 
 
 @pytest.mark.heavy
-def test_everything_is_imported_without_what_only_posix_has():
+def test_everything_is_imported_without_posix_modules():
     done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 200
@@ -70,7 +70,7 @@ def test_a_log_finds_its_place_without_locks(no_posix, tmp_path, monkeypatch):
     assert place.older is not None
     assert len(list(tmp_path.iterdir())) == 2
 
-    def in_use(self, target):      # Windows renames nothing that is open
+    def in_use(self, target):      # Windows renames no open file
         raise PermissionError(13, "in use")
 
     monkeypatch.setattr("pathlib.Path.rename", in_use)
@@ -81,7 +81,7 @@ def test_a_log_finds_its_place_without_locks(no_posix, tmp_path, monkeypatch):
     assert other.path != tmp_path / "run.mcap"
 
 
-def test_a_simulated_serial_line_says_that_there_is_none(no_posix):
+def test_a_simulated_serial_line_is_refused_with_a_reason(no_posix):
     from profiles.errors import TdhilError
     from sim_bus.modbus.lines import RtuListener
 
@@ -89,7 +89,7 @@ def test_a_simulated_serial_line_says_that_there_is_none(no_posix):
         RtuListener(None, baud=19200, parity="E", stop_bits=1)
 
 
-def test_signals_that_the_system_lacks_are_left_out(monkeypatch):
+def test_missing_signals_of_a_system_are_omitted(monkeypatch):
     import signal
 
     from tdhil.session.stop_signals import stop_on_signals
@@ -100,7 +100,7 @@ def test_signals_that_the_system_lacks_are_left_out(monkeypatch):
         assert request is not None
 
 
-def test_the_hint_installs_from_where_this_was_installed(monkeypatch, tmp_path):
+def test_the_hint_installs_from_the_source_of_this_installation(monkeypatch, tmp_path):
     from tdhil import version
     from tdhil.report.page import install_command
 

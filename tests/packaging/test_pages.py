@@ -1,4 +1,4 @@
-"""The pages that are made of README, docs/ and the docstrings; building them is a step of .ci/run."""
+"""Pages made of README, docs/ and docstrings; .ci/run builds them in one step."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def test_the_front_door_is_documented_name_by_name():
     assert set(re.findall(r"^::: tdhil\.api\.(\w+)$", page, re.MULTILINE)) == set(api.__all__)
 
 
-def test_contributing_names_what_is_there():
-    """Every path and every test, but for those in which VENDOR, MODEL, NAME or BUS stands."""
+def test_contributing_names_existing_files_and_tests():
+    """The check covers every path and every test, except for those with VENDOR, MODEL, NAME or BUS."""
     rooms = "tdhil|drivers|sim_bus|profiles|tests|benchmarks|docs|examples"
     names = [name for name in re.findall(rf"`((?:{rooms})/[^`\s]*)`", CONTRIBUTING) if not re.search("[A-Z]{3}", name)]
     assert len(names) > 80
@@ -72,7 +72,7 @@ def test_a_link_to_a_folder_ends_the_build(hooks):
     '<link rel="stylesheet" href="https://fonts.example/css">', '@import "https://fonts.example/css";',
     "a { background: url(https://cdn.example/x.png) }",
 ])
-def test_what_would_be_loaded_from_elsewhere_is_found(hooks, text):
+def test_external_resources_are_found(hooks, text):
     assert hooks.loaded_from_elsewhere(text)
 
 

@@ -1,4 +1,4 @@
-"""No function of the source takes more than eight parameters, but for those named here, which gain no more.
+"""Functions of the source have at most eight parameters, except for those named here, which get no more.
 
 Complexity has its limit in `pyproject.toml` (ruff, C901).
 """
@@ -40,7 +40,7 @@ EXCEPTIONS = {
     "tdhil/soft_torque/simulation.py: simulate": 10,
     "tdhil/soft_torque/uncertainty.py: draw_truths": 10,
 }
-"""Functions with more, and their number. A number is lowered when a function is mended, never raised."""
+"""Functions with more, and their number. A number is lowered with a correction, never raised."""
 
 
 def parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -62,6 +62,6 @@ def test_no_function_takes_more_than_eight_parameters():
 
 @pytest.mark.parametrize(("source", "count"), [
     ("def f(self, a, b=1, *, c): ...", 3), ("def f(a, /, b, *args, **kwargs): ...", 2), ("async def f(cls): ...", 0)])
-def test_what_counts_as_a_parameter(source, count):
+def test_rule_for_parameters(source, count):
     (node,) = ast.parse(source).body
     assert parameters(node) == count

@@ -1,6 +1,6 @@
-"""Every name that a test takes from a module of ours, or replaces in one, is there.
+"""Every name that a test imports from tdhil's modules, or replaces in one, exists.
 
-A commit's CI runs one of nine shares of the heavy cases (decision 0061): a name that moved would be noticed late.
+CI of a commit runs one of nine shares of the heavy cases (decision 0061), so a moved name would be found late.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
 
 
 def imported(tree: ast.Module) -> dict[str, object]:
-    """Return the modules and classes of ours that the file imports by name."""
+    """Return the modules and classes of tdhil that the file imports by name."""
     found: dict[str, object] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -52,12 +52,12 @@ def missing(tree: ast.Module) -> Iterator[str]:
         thing = ours.get(holder)
         if thing is None or holder in assigned or hasattr(thing, name):
             continue
-        if isinstance(thing, ModuleType) or name.startswith("_"):        # a field of a dataclass is no attribute of it
+        if isinstance(thing, ModuleType) or name.startswith("_"):        # a field of a dataclass is no class attribute
             yield f"line {node.lineno}: {holder}.{name}"
 
 
 def dotted(tree: ast.Module) -> Iterator[str]:
-    """Yield each dotted text of ``setattr`` that leads nowhere, with its line."""
+    """Yield each dotted text of ``setattr`` without a target, with its line."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "setattr" \
                 and len(node.args) == 2 and isinstance(node.args[0], ast.Constant):
@@ -70,7 +70,7 @@ def dotted(tree: ast.Module) -> Iterator[str]:
 
 
 def resolved(text: str) -> object:
-    """Return the module or class of this dotted name; None if there is none."""
+    """Return the module or class of this dotted name, or None."""
     try:
         return importlib.import_module(text)
     except ModuleNotFoundError:
@@ -78,7 +78,7 @@ def resolved(text: str) -> object:
         return getattr(resolved(holder), name, None) if holder else None
 
 
-def test_every_name_is_there():
+def test_every_name_exists():
     pytest.importorskip("matplotlib")
     pytest.importorskip("starlette")
     wrong = []
@@ -97,7 +97,7 @@ def test_a_name_that_moved_is_found(text, wrong):
     assert len(list(missing(ast.parse(text)))) == wrong
 
 
-def test_a_dotted_text_that_leads_nowhere_is_found():
+def test_a_dotted_text_without_a_target_is_found():
     text = "patch.setattr('tdhil.errors.{}', 1)\n"
     assert not list(dotted(ast.parse(text.format("UsageError"))))
     assert len(list(dotted(ast.parse(text.format("gone"))))) == 1

@@ -21,7 +21,7 @@ PACKAGES = {
     ".".join(path.parent.relative_to(ROOT).parts): path for room in ROOMS for path in (ROOT / room).rglob("__init__.py")
 }
 LAZY = sorted(package for package, path in PACKAGES.items() if "lazy_names(__name__" in path.read_text("utf-8"))
-# Modules whose names are clear only together with the module, and the main modules of the processes.
+# Modules whose names are clear only with the module, and the main modules of processes.
 OPEN = {"profiles.quantities", "profiles.canopen", "profiles.cia402", "profiles.ethercat", "profiles.modbus",
         "drivers.undo_journal", "drivers.own_limits", "tdhil.session.real_time", "tdhil.cli.main"}
 
@@ -30,7 +30,7 @@ IMPORT = re.compile(rf"^ *from ((?:{'|'.join(ROOMS)})(?:\.\w+)*) import (\([^)]*
 
 
 def imports(path: Path) -> list[tuple[ast.ImportFrom, bool]]:
-    """Each import from our own packages, and whether only mypy sees it."""
+    """Yield each import from tdhil's packages, and whether only mypy sees it."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     typed = {id(inner) for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
              for one in node.body for inner in ast.walk(one)}
@@ -39,7 +39,7 @@ def imports(path: Path) -> list[tuple[ast.ImportFrom, bool]]:
 
 
 @pytest.mark.parametrize("package", LAZY)
-def test_mypy_and_python_know_the_same_names(package):
+def test_mypy_and_python_have_the_same_names(package):
     module = import_module(package)
     shown = {one.name: node.module for node, typed in imports(PACKAGES[package]) if typed for one in node.names}
     assert sorted(shown) == module.__all__ == dir(module)
@@ -48,7 +48,7 @@ def test_mypy_and_python_know_the_same_names(package):
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
 def test_no_public_name_is_a_module_of_its_package(package):
-    # Python makes a package's attribute the module once that is loaded: the name would be the one or the other.
+    # Once loaded, a module becomes an attribute of its package. The name would be ambiguous.
     names = {one.asname for node, _ in imports(PACKAGES[package]) for one in node.names}
     assert names.isdisjoint(module.name for module in iter_modules([str(PACKAGES[package].parent)]))
 
@@ -74,14 +74,14 @@ def test_a_name_is_loaded_when_it_is_used(monkeypatch):
     get, listed, public = lazy_names("a_package", {"behind": "answer"})
     assert listed() == public == ["answer"]
     assert get("answer") == 41
-    monkeypatch.setattr(behind, "answer", 42)      # replaced where it is defined: the package has no copy of its own
+    monkeypatch.setattr(behind, "answer", 42)      # replaced at its definition: the package has no copy
     assert get("answer") == 42
     with pytest.raises(AttributeError, match="module 'a_package' has no attribute 'question'"):
         get("question")
 
 
 def test_estimation_loads_neither_drives_nor_files():
-    # The contract can't see which names of a package are used.
+    # The import contract cannot check which names of a package are used.
     script = (
         "import sys, tdhil.estimation\n"
         "print(*sorted({'drivers', 'sim_bus', 'can', 'canopen', 'mcap', 'pydantic'} & set(sys.modules)))"

@@ -1,4 +1,4 @@
-"""The README can be believed: its commands parse, its files load, its links lead somewhere."""
+"""README: its commands parse, its files load, and its links resolve."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PAGES = sorted([ROOT / "README.md", *ROOT.glob("CONTRIBUTING.md"), *(ROOT / "doc
 
 GUIDES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("tutorials/*.md")),
           *sorted((ROOT / "docs").glob("how-to/*.md"))]
-NOT_COMPLETE = ("…", "$EDITOR")                 # a command that says so
+NOT_COMPLETE = ("…", "$EDITOR")                 # a command that states this
 
 
 def blocks(language: str, text: str = README) -> list[str]:
@@ -65,7 +65,7 @@ def test_the_readme_is_one_page():
     assert len(README.splitlines()) <= 160
 
 
-def test_the_help_of_the_options_it_names():
+def test_the_options_it_names_are_in_the_help():
     text = build_parser("identify").format_help() + _help_of("identify")
     for option in set(re.findall(r"`(--[a-z-]+)[ `|]", README)) - {"--hub"}:
         assert option in text, option
@@ -85,13 +85,13 @@ def test_rig_yaml_loads(tmp_path):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_an_extra_is_installed_from_the_clone_or_from_a_folder(page):
-    """The pages install the clone, and no package of this name from elsewhere."""
+    """The pages install the clone, not a package with this name from another source."""
     lines = page.read_text(encoding="utf-8").splitlines()
     assert [line for line in lines if re.search(r"pip install .*\btdhil\b", line) and "--find-links" not in line] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
+def test_links_resolve(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target
@@ -106,10 +106,10 @@ def test_code_fits_80_columns():
 def test_marked_command_is_one_command(name):
     (text,) = re.findall(rf"^<!-- command: {name} -->\n```sh\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
     assert subprocess.run(["bash", "-n", "-c", text]).returncode == 0
-    assert not re.search(r"(?<!&&)(?<!\\)\n(?!\Z)", text), "lines must be joined, so that a failure ends it"
+    assert not re.search(r"(?<!&&)(?<!\\)\n(?!\Z)", text), "the lines must be joined, so that a failure ends it"
 
 
-def test_ci_runs_the_very_same_command():
+def test_ci_runs_the_same_command():
     if not (path := ROOT / ".ci" / "run").exists():
         pytest.skip("a source distribution has no .ci/run")
     script = path.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Every back-quoted name in comments, docstrings and pages leads to something that is there.
+"""Every back-quoted name in comments, docstrings and pages exists.
 
 In the source single back-quotes are a reference; double ones mark a parameter, a field or a literal. The pages have
 single ones for everything, so there only paths, dotted names of ours, classes, calls and names_with_underscores are
@@ -47,7 +47,7 @@ EXCEPTIONS = {
     "a schema of Foxglove": {"foxglove.Log"},
     "keys of rig.yaml in another unit, which quantities.py makes": {"probe_travel_deg", "torque_knm"},
 }
-# A decision keeps the names of its day: a later one says what became of them.
+# A decision record keeps its names; a later record states their changes.
 OF_THEIR_DAY = {
     "drivers/cia402/link.py": "drivers/canopen/bus.py",
     "tdhil/record/schema.py": "tdhil/recording/log_format.py",
@@ -72,7 +72,7 @@ KNOWN = set().union(*EXCEPTIONS.values())
 
 @dataclass
 class Module:
-    """What one file defines, and which identifiers stand in its code."""
+    """Definitions and identifiers of one file."""
 
     path: Path
     members: set[str] = field(default_factory=set)
@@ -93,7 +93,7 @@ def read(path: Path) -> Module:
     statements: list[tuple[ast.stmt, set[str] | None]] = []
 
     def look(node: ast.AST, names: set[str] | None) -> None:
-        """``names``: of the module or class whose body this is; None inside of a function."""
+        """Scan a body. ``names``: those of its module or class; None inside a function."""
         body = getattr(node, "body", [])
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             first = body[0] if body else None
@@ -129,7 +129,7 @@ def read(path: Path) -> Module:
         if not mark:
             continue
         if number and not code.strip() and module.texts and module.texts[-1][0] == -number:
-            module.texts[-1] = (-number - 1, f"{module.texts[-1][1]} {comment.strip(' :#')}")    # it goes on
+            module.texts[-1] = (-number - 1, f"{module.texts[-1][1]} {comment.strip(' :#')}")    # continued
         else:
             module.texts.append((-number - 1, comment.strip(" :#")))
     module.words = set(WORD.findall("\n".join(lines)))
@@ -137,7 +137,7 @@ def read(path: Path) -> Module:
 
 
 class House:
-    """All modules of the rooms."""
+    """All modules of all rooms."""
 
     def __init__(self) -> None:
         self.modules = [read(path) for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
@@ -157,7 +157,7 @@ class House:
         self.files = [path.relative_to(ROOT).as_posix() for folder in FOLDERS for path in (ROOT / folder).rglob("*")
                       if "__pycache__" not in path.parts]
         self.files += [path.name for path in ROOT.iterdir()] + [".ci/run"]
-        # Each file's path and each end of it that begins a part, so that a name is found without a search.
+        # The path of each file and all its trailing parts, so that a name is found without a search.
         self.ends = {file.split("/", n)[-1] for file in self.files for n in range(file.count("/") + 1)}
 
     def in_class(self, name: str, member: str, seen: frozenset[str] = frozenset()) -> bool:
@@ -173,7 +173,7 @@ class House:
         return name in self.ends or (near.parent / name).exists()
 
     def resolves(self, name: str) -> bool:
-        """Is ``name`` a module, or what follows a module or a class a member of it?"""
+        """Return whether ``name`` is a module, or a member of a module or class."""
         if name in self.by_end:
             return True
         head, _, last = name.rpartition(".")
@@ -193,13 +193,13 @@ def is_known(name: str) -> bool:
 
 
 def room_of(dotted: str) -> str:
-    """The package in whose modules one word is enough to name another: ``tdhil.runner``, ``drivers``."""
+    """Return the package in whose modules one word is sufficient for a name: ``tdhil.runner``, ``drivers``."""
     parts = dotted.split(".")
     return ".".join(parts[:2]) if parts[0] == "tdhil" else parts[0]
 
 
 def in_source(house: House, module: Module, name: str) -> bool:
-    """Does a reference of a comment or docstring lead somewhere, or is it none?"""
+    """Return whether a reference of a comment or docstring resolves, or is no reference."""
     name = name.removesuffix("()")
     if PATH.match(name) and not DOTTED.match(name.removesuffix(".py")):
         return house.has_file(name, module.path)
@@ -220,7 +220,7 @@ def in_source(house: House, module: Module, name: str) -> bool:
     return first in module.words and all(part in house.words for part in rest.split("."))
 
 
-def test_every_reference_of_the_source_leads_somewhere(house):
+def test_every_reference_of_the_source_resolves(house):
     found = [f"{module.path.relative_to(ROOT)}:{abs(line)}: {name}" for module in house.modules
              for line, text in module.texts for name in CODE.findall(text)
              if not is_known(name) and not in_source(house, module, " ".join(name.split()))]
@@ -228,7 +228,7 @@ def test_every_reference_of_the_source_leads_somewhere(house):
 
 
 def on_page(house: House, page: Path, name: str) -> bool:
-    """Does a back-quoted name of a page lead somewhere, or is it none of ours?"""
+    """Return whether a back-quoted name of a page resolves, or is no name of tdhil."""
     if re.search(r"[A-Z]{3}|[<>*… {}]", name) and not CLASS.match(name):
         return True
     path, _, test = name.partition("::")
@@ -247,7 +247,7 @@ def on_page(house: House, page: Path, name: str) -> bool:
     return house.resolves(name) or first not in (*ROOMS, *house.classes)
 
 
-def test_every_reference_of_the_pages_leads_somewhere(house):
+def test_every_reference_of_the_pages_resolves(house):
     found = [f"{page.relative_to(ROOT)}:{line}: {name}" for page in PAGES
              for line, text in enumerate(page.read_text(encoding="utf-8").split("\n"), 1) for name in CODE.findall(text)
              if not is_known(name) and not on_page(house, page, name)
@@ -258,22 +258,22 @@ def test_every_reference_of_the_pages_leads_somewhere(house):
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("gone", ["let_go", "verdict.conclude", "tdhil.runner.let_go", "Guard.looks_away",
                                   "gone_file.py", "tdhil/runner/gone.py", "control_loop.gone()"])
-def test_a_name_that_is_gone_is_found(house, gone):
+def test_a_removed_name_is_found(house, gone):
     (guard,) = house.by_end["tdhil.runner.guard"]
     assert not in_source(house, guard, gone)
 
 
 @pytest.mark.parametrize("gone", ["let_go_of", "WorkerOfOld", "tdhil.runner.let_go", "tdhil/runner/gone.py",
                                   "tests/packaging/test_house.py::test_gone", "Guard.looks_away", "gone_thing()"])
-def test_a_name_that_is_gone_is_found_on_a_page(house, gone):
+def test_a_removed_name_is_found_on_a_page(house, gone):
     assert not on_page(house, ROOT / "README.md", gone)
 
 
-def test_what_a_decision_called_otherwise_is_where_the_table_says(house):
+def test_renamed_things_of_decisions_are_at_the_place_in_the_table(house):
     assert [new for new in OF_THEIR_DAY.values() if not on_page(house, ROOT / "README.md", new)] == []
 
 
-def test_no_exception_is_left_over(house):
+def test_no_exception_is_unused(house):
     texts = [text for module in house.modules for _, text in module.texts]
     texts += [page.read_text(encoding="utf-8") for page in PAGES]
     assert [name for name in (*KNOWN, *OF_THEIR_DAY) if not any(f"`{name}`" in text for text in texts)] == []

@@ -1,4 +1,4 @@
-"""Tests in real time are run again where this computer stood still meanwhile, and no others are."""
+"""Tests in real time are run again if this computer paused during them, and no other tests are."""
 
 import subprocess
 import sys
@@ -35,9 +35,9 @@ def test_one(number):
 @pytest.mark.parametrize(("what", "still_s", "calls", "passes"), [
     ("number > 1 or stand_still(); assert number > 1", 0.5, 2, True),
     ("stand_still(); assert False", 0.5, 4, False),
-    ("stand_still(); assert False", 1e9, 1, False),        # that was no standstill
+    ("stand_still(); assert False", 1e9, 1, False),        # no pause of the computer
 ])
-def test_a_failure_counts_once_this_computer_was_there_all_the_time(tmp_path, what, still_s, calls, passes):
+def test_a_failure_counts_if_this_computer_did_not_pause(tmp_path, what, still_s, calls, passes):
     conftest = (Path(__file__).parents[1] / "conftest.py").read_text()
     assert "\nSTOOD_STILL_S = 0.5\n" in conftest
     (tmp_path / "conftest.py").write_text(conftest.replace("STOOD_STILL_S = 0.5", f"STOOD_STILL_S = {still_s}"))

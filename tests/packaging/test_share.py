@@ -1,4 +1,4 @@
-"""The shares of the heavy cases have each case once, and those that each share has."""
+"""Shares of the heavy cases: each case is in one share, and some cases are in every share."""
 
 import os
 import subprocess

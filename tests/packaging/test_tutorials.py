@@ -1,7 +1,7 @@
-"""The tutorials can be followed to the letter: their commands are taken out of the pages and run, in order.
+"""Tutorials: the commands of the pages are run in order, exactly as printed.
 
-A run of theirs has 50 cycles a second here, a fifth of the drive's usual rate, and of what there is to compute.
-The pages name fixed ports. Each page therefore has a network of its own, so that another service takes none of them.
+The runs have 50 cycles per second here, a fifth of the usual rate of the drive, to save computing time.
+The pages name fixed ports. Each page therefore has its own network, so that no other service uses these ports.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ BLOCK = re.compile(r"^(?:<!-- (run[^\n]*) -->\n)?```sh\n(.*?)^```$", re.DOTALL |
 PORT = re.compile(r"127\.0\.0\.1:(\d+)|\bport=(\d+)")
 PATIENCE_S = 300.0
 IN_OTHERS = "read-a-result.md"
-"""Its two commands, a simulated run and a replay as JSON, are those of the pages on a first run."""
+"""Tutorial whose two commands, a simulated run and a replay as JSON, are those of the pages on a first run."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A block of a page: run it and expect an exit code, or beside the others until ``ready`` is printed."""
+    """Block of a page: run it and expect an exit code, or run it in parallel until ``ready`` is printed."""
 
     text: str
     code: int = 0
@@ -54,7 +54,7 @@ def steps(page: str) -> list[Step]:
 
 
 def slower(folder: Path) -> Path:
-    """Make a folder with a `tdhil` that runs at 50 Hz whatever it identifies."""
+    """Make a folder with a `tdhil` that runs each identification at 50 Hz."""
     program = folder / "bin" / "tdhil"
     program.parent.mkdir()
     program.write_text(f"""#!/bin/sh
@@ -67,7 +67,7 @@ exec '{Path(sys.executable).parent / "tdhil"}' "$@"
 
 @contextlib.contextmanager
 def beside(step: Step, folder: Path, environment: dict[str, str], enter: tuple[str, ...]) -> Iterator[None]:
-    """A program of the second terminal. ``enter``: words before a command, which run it in the page's network."""
+    """Run a program of the second terminal. ``enter``: command prefix that selects the network of the page."""
     said = folder / "second-terminal.txt"
     with said.open("w") as file:
         child = subprocess.Popen([*enter, "bash", "-euo", "pipefail", "-c", f"exec {step.text}"], cwd=folder,
@@ -84,7 +84,7 @@ def beside(step: Step, folder: Path, environment: dict[str, str], enter: tuple[s
 
 
 def taken_ports(page: str) -> list[int]:
-    """Return the ports of a page that another program of this computer has."""
+    """Return the ports of a page that another program on this computer uses."""
     found = {int(one or other) for one, other in PORT.findall((FOLDER / page).read_text(encoding="utf-8"))}
     taken = []
     for port in sorted(found):
@@ -97,8 +97,8 @@ def taken_ports(page: str) -> list[int]:
     return taken
 
 
-def test_a_network_of_its_own_has_every_port_free():
-    """A server of this computer holds the port of the service; a program in the other network takes it all the same."""
+def test_in_its_own_network_every_port_is_free():
+    """A server on this computer holds the port of the service. A program in the other network can still use it."""
     with socket.socket() as server, own_network() as enter:
         server.bind(("127.0.0.1", 0))
         server.listen()
@@ -127,7 +127,7 @@ def test_there_are_tutorials_with_commands():
 @pytest.mark.parametrize("page", [
     pytest.param(page, marks=pytest.mark.long if page == IN_OTHERS else ()) for page in PAGES
 ])
-def test_a_tutorial_can_be_followed_to_the_letter(page, tmp_path):
+def test_a_tutorial_runs_as_printed(page, tmp_path):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (pip install '.[report]')")
     pytest.importorskip("uvicorn", reason="uvicorn is not installed (pip install '.[service]')")
     environment = clean_environment()

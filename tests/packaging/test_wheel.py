@@ -1,4 +1,4 @@
-"""What is in the wheel, and what is not. Built with hatchling as installed here, without a network."""
+"""Content of the wheel, built with the installed hatchling, without a network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PACKAGES = ("tdhil", "drivers", "sim_bus", "profiles")
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> zipfile.ZipFile:
-    """Of a copy of the tree, since the build backend reads .gitignore and may write beside it."""
+    """Build the wheel of a copy of the tree, since the build backend reads .gitignore and may write beside it."""
     source, out = tmp_path_factory.mktemp("source") / "tdhil", tmp_path_factory.mktemp("dist")
     source.mkdir()
     for name in (".gitignore", "pyproject.toml", "README.md", "LICENSE"):
@@ -42,7 +42,7 @@ def names(wheel) -> set[str]:
 
 
 @pytest.mark.heavy
-def test_pure_python_for_every_machine(wheel):
+def test_pure_python_for_every_platform(wheel):
     assert wheel.filename is not None
     assert wheel.filename.endswith("-py3-none-any.whl")
 
@@ -55,7 +55,7 @@ def test_four_packages_and_nothing_else_at_the_top(names):
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_every_module_and_every_data_file_is_there(package, names):
+def test_every_module_and_every_data_file_is_included(package, names):
     wanted = {str(path.relative_to(ROOT)) for path in (ROOT / package).rglob("*")
               if path.suffix in {".py", ".yaml", ".eds", ".typed", ".po"} and "__pycache__" not in path.parts}
     assert f"{package}/__init__.py" in wanted
@@ -67,7 +67,7 @@ def test_profiles_come_with_their_eds(names):
     assert {"profiles/generic/cia402.yaml", "profiles/generic/cia402.eds"} <= names
 
 
-def test_documentation_and_examples_come_along(names):
+def test_documentation_and_examples_are_included(names):
     wanted = {"tdhil/_docs/README.md"}
     wanted |= {f"tdhil/_docs/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
     wanted |= {f"tdhil/_docs/{folder}/{path.name}" for folder in ("examples", "deploy")
@@ -75,7 +75,7 @@ def test_documentation_and_examples_come_along(names):
     assert wanted - names == set()
 
 
-def test_nothing_that_a_user_does_not_run(names):
+def test_no_development_files_are_included(names):
     assert [name for name in names if name.endswith((".mcap", ".pyc")) or "tests" in name.split("/")] == []
 
 

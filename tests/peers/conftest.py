@@ -1,11 +1,11 @@
-"""Peers that are none of ours: what they need, and what happens where it is missing.
+"""Peers of other vendors: their requirements, and the skip without them.
 
-The npm packages (all MIT) are fetched only when somebody asks for them, into a folder of his choice::
+The npm packages (all MIT) are fetched on request only, into a chosen folder::
 
     npm install --prefix DIR canopen@6.2.1 @foxglove/ws-protocol@0.8.0 ws@8
     TDHIL_NPM_CANOPEN=DIR TDHIL_NPM_FOXGLOVE=DIR python -m pytest tests/peers
 
-Without node or that folder the tests are skipped and say so; TDHIL_REQUIRE_PEERS=1 turns that into a failure.
+Without node or that folder the tests are skipped with a reason; TDHIL_REQUIRE_PEERS=1 turns that into a failure.
 """
 
 import os
@@ -20,7 +20,7 @@ HOW = ("run them with: npm install --prefix DIR canopen@6.2.1 @foxglove/ws-proto
 
 
 def what_is_missing(variable):
-    """Why the packages of this variable can't be used, or None if they can."""
+    """Return why the packages of this variable cannot be used, or None if they can."""
     if shutil.which("node") is None:
         return "node is not on PATH"
     folder = os.environ.get(variable)
@@ -44,7 +44,7 @@ def program_of(variable):
 
 @pytest.fixture
 def node_program():
-    """The command that runs one of our JavaScript files with the package at hand."""
+    """Return the command that runs one of our JavaScript files with the package available."""
     return program_of("TDHIL_NPM_CANOPEN")
 
 
@@ -59,7 +59,7 @@ def _in_a_folder_of_its_own(no_bus_of_the_user):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """A quiet run hides the reasons of skipped tests; this one must be seen."""
+    """Print the reason of the skip, since a quiet run hides it."""
     skipped = [report for report in terminalreporter.stats.get("skipped", ()) if HOW in str(report.longrepr)]
     if skipped:
         missing = ", ".join(filter(None, map(what_is_missing, PACKAGES)))

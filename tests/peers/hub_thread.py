@@ -1,4 +1,4 @@
-"""A socketcand hub with nobody of ours on it, in a thread of the test."""
+"""socketcand hub without tdhil clients, in a thread of the test."""
 
 import contextlib
 import threading
@@ -8,7 +8,7 @@ from sim_bus.canopen.socketcand import Hub
 
 @contextlib.contextmanager
 def open_hub():
-    """The hub, polled until the end of the block; ``port`` says where."""
+    """Yield the hub, polled until the end of the block; ``port`` is its port."""
     hub, ended = Hub(), threading.Event()
 
     def poll():

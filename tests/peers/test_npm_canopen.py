@@ -1,4 +1,4 @@
-"""The npm package `canopen`, somebody else's CANopen: as a master of our simulated drive, as a slave of our driver.
+"""The npm package `canopen`, an independent CANopen stack: master of the simulated drive, and slave of the driver.
 
 How to get it and run these: tests/peers/conftest.py. Its frames are its own; socketcand_channel.mjs only carries them
 to our hub. What the package leaves out is typed in the .mjs files and said there: the state machine of CiA 402, the
@@ -32,7 +32,7 @@ SLAVE_INERTIA, SLAVE_VISCOUS, SLAVE_COULOMB = 60.0, 6.0, 40.0      # npm_slave.m
 
 @pytest.fixture
 def steps(node_program, tmp_path):
-    """What the foreign master found, step by step, and what the shaft of our simulated drive did."""
+    """Return the findings of the foreign master, step by step, and the motion of the simulated shaft."""
     command, environment = node_program("npm_master.mjs")
     with peer(tmp_path, "--seed", 1, "--node", NODE) as drive:
         port = dict(option.split("=") for option in drive.options if "=" in option)["port"]
@@ -92,7 +92,7 @@ def test_a_foreign_master_drives_our_simulated_drive(steps):
 
 @pytest.fixture
 def slave(node_program):
-    """(hub, the slave's process): a foreign drive on a hub of its own."""
+    """Yield (hub, process of the slave): a foreign drive on its own hub."""
     command, environment = node_program("npm_slave.mjs")
     with open_hub() as hub, process(*command, hub.host, hub.port, NODE, env=environment, stdout=subprocess.PIPE,
                                     stderr=subprocess.PIPE) as child:
@@ -163,7 +163,7 @@ def test_our_driver_drives_a_foreign_slave(slave):
 
 
 def test_a_foreign_slave_loses_our_heartbeat(slave):
-    """Armed by us over SDO, noticed by the package's own timer, in real time."""
+    """The driver arms it over SDO, and the timer of the package detects the loss, in real time."""
     hub, child = slave
     drive = driver(hub, MonotonicClock(), rate_hz=50.0)
     drive.connect()
@@ -171,7 +171,7 @@ def test_a_foreign_slave_loses_our_heartbeat(slave):
     drive.enable(Mode.SPEED)
     for _ in range(100):
         drive.exchange(Command(Mode.SPEED, 2.0, 0.0))
-    lost = json.loads(child.stdout.readline())      # nothing is exchanged any more: the watchdog must act
+    lost = json.loads(child.stdout.readline())      # no more exchange: the watchdog must act
     assert lost["event"] == "heartbeat lost"
     assert lost["node"] == 127
     assert lost["turning"] > 0.5
@@ -180,7 +180,7 @@ def test_a_foreign_slave_loses_our_heartbeat(slave):
 
 
 def test_the_five_stages_on_a_foreign_slave(slave, tmp_path):
-    """`tdhil identify`, whole, with not one frame of the simulator's: J of the package's drive, and its replay."""
+    """The whole of `tdhil identify` runs without the simulator: J of the package's drive, and its replay."""
     hub, child = slave
     done = identify(
         tmp_path, "-i", "socketcand", "-c", hub.channel, "--bus-kwargs", f"host={hub.host}", f"port={hub.port}",

@@ -1,4 +1,4 @@
-"""The npm package `@foxglove/ws-protocol`, the protocol's own client: it gets what the log holds, byte for byte.
+"""The npm package `@foxglove/ws-protocol`, the client of the protocol: it receives the log byte for byte.
 
 How to get it and run these: tests/peers/conftest.py.
 """
@@ -16,12 +16,12 @@ from tests.service.test_foxglove import by_topic, declared, logged
 from tests.service.test_serve import QUICK, served
 
 EACH_CYCLE = ("/sample", "/command", "/can")
-"""What a viewer loses that stays behind."""
+"""Topics that a slow viewer loses."""
 
 
 @pytest.mark.parametrize("protocol", ["foxglove.websocket.v1", "foxglove.sdk.v1"])
-def test_the_protocol_s_own_client_gets_what_the_log_holds(foxglove_program, tmp_path, protocol):
-    """A simulated run from its request to its result, watched from before it begins."""
+def test_the_client_of_the_protocol_receives_the_content_of_the_log(foxglove_program, tmp_path, protocol):
+    """The client watches a simulated run from before its start to its result."""
     command, environment = foxglove_program("foxglove_client.mjs")
     data, said = tmp_path / "data", tmp_path / "said.txt"
     with served(data) as server, said.open("wb") as out:
@@ -49,6 +49,6 @@ def test_the_protocol_s_own_client_gets_what_the_log_holds(foxglove_program, tmp
     assert len(got) + left_out == len(wanted) > 10_000
     assert list(by_topic(got)) == list(by_topic(wanted))
     for topic, messages in by_topic(got).items():
-        left = iter(by_topic(wanted)[topic])       # in their order; on a busy computer, but for what it was told of
+        left = iter(by_topic(wanted)[topic])       # in their order; on a busy computer without the reported losses
         assert all(one in left for one in messages), topic
         assert len(messages) == len(by_topic(wanted)[topic]) or (left_out and topic in EACH_CYCLE)

@@ -1,1 +1,1 @@
-"""Many logs."""
+"""Tests of the process pool."""

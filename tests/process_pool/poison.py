@@ -1,4 +1,4 @@
-"""What a task may do to the process that has it. A module's functions, so that the processes find them by name."""
+"""Tasks that disturb their process. The functions are in a module, so that the processes find them by name."""
 
 import ctypes
 import os
@@ -9,9 +9,9 @@ KILLS, HANGS, EATS, OUTSIDE = b"poison: kills", b"poison: hangs", b"poison: eats
 
 
 def act(head):
-    """What so many bytes ask for; nothing where they are no poison."""
+    """Execute the effect of these bytes; do nothing if they are no poison."""
     if head.startswith(KILLS):
-        ctypes.string_at(0)                            # SIGSEGV, as a library at fault would
+        ctypes.string_at(0)                            # SIGSEGV, as from a faulty library
     if head.startswith(HANGS):
         time.sleep(3600)
     if head.startswith(EATS):
@@ -21,7 +21,7 @@ def act(head):
 
 
 def work(task):
-    """What a number, a word or a poison asks for."""
+    """Process a number, a word or a poison."""
     if isinstance(task, bytes):
         act(task)
     if task == "raise":

@@ -1,4 +1,4 @@
-"""The pool: every task gets its answer or its loss, once, whatever happens to its processes."""
+"""Process pool: every task gets one result or one loss, with any fault of its processes."""
 
 import os
 import pickle
@@ -26,7 +26,7 @@ def test_every_task_is_answered_once():
     with Pool(poison.work, 2, LIMITS) as pool:
         found = dict(pool.run(tasks))
         assert found == {task: b"x" * 3_000_000 if task == "much" else task for task in tasks}
-        assert dict(pool.run([1])) == {1: 1}           # the processes stay
+        assert dict(pool.run([1])) == {1: 1}           # the processes are kept
         pids = pool.pids()
     assert len(pids) == 2
     for pid in pids:
@@ -34,8 +34,8 @@ def test_every_task_is_answered_once():
             os.kill(pid, 0)
 
 
-def test_an_answer_that_comes_with_the_first_word_is_not_waited_for():
-    """Both in one read: nothing more comes, and the task would have been lost when its time was over."""
+def test_a_result_that_arrives_with_the_first_message_is_found_at_once():
+    """Both arrive in one read. Without this rule the pool would wait for more data until the time-out of the task."""
     fcntl, termios = pytest.importorskip("fcntl"), pytest.importorskip("termios")
     worker = process_pool._Worker(LIMITS)
     worker.give(poison.work, process_pool._Job(7), 30.0)
@@ -47,8 +47,8 @@ def test_an_answer_that_comes_with_the_first_word_is_not_waited_for():
 
 
 @pytest.mark.heavy
-def test_what_ends_its_process_or_hangs_is_set_aside_and_the_rest_goes_on(monkeypatch):
-    """The time of the limit goes on only while nothing but what hangs is left: no slow computer loses the others."""
+def test_a_task_that_ends_its_process_or_hangs_is_isolated_and_the_rest_continues(monkeypatch):
+    """The time limit counts only while no other task is left, so a slow computer loses no other tasks."""
     bad = [poison.KILLS, poison.HANGS, poison.OUTSIDE]
     found, wanted = {}, 11 + len(bad)
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() if len(found) == wanted - 1 else 0.0)
@@ -69,7 +69,7 @@ def test_memory_is_limited():
         list(pool.run([poison.EATS]))
 
 
-def test_a_mistake_of_the_function_is_raised_here():
+def test_an_exception_of_the_function_is_raised_here():
     with Pool(poison.work, 1, LIMITS) as pool, pytest.raises(ValueError, match="as asked") as caught:
         list(pool.run(["raise"]))
     assert "In a process of its own" in caught.value.__notes__[0]
@@ -82,7 +82,7 @@ def test_without_limits():
 
 @pytest.mark.heavy
 def test_processes_killed_at_random():
-    """Twelve kills over sixty tasks, some while idle: nothing is lost, nothing comes twice."""
+    """With twelve kills in sixty tasks, some while idle, no task is lost and none has two results."""
     rng = random.Random(3)
     with Pool(poison.work, 2, LIMITS) as pool:
         found, kills = [], 0
@@ -96,7 +96,7 @@ def test_processes_killed_at_random():
     assert sorted(found) == [0.01 + k / 1e4 for k in range(60)]
 
 
-def test_processes_that_never_begin_end_the_pool(monkeypatch):
+def test_processes_that_never_start_end_the_pool(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with Pool(poison.work, 2, LIMITS) as pool, pytest.raises(TdhilError, match="end before they begin"):
         list(pool.run(range(50)))
@@ -113,14 +113,14 @@ with Pool(poison.work, 1, TaskLimits()) as pool:
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_the_processes_end_with_their_host(how):
-    """Also one in the middle of a task; of a Ctrl-C, which goes to the host's whole group, it sees nothing."""
+    """This includes a process within a task. Ctrl-C goes to the group of the host and does not reach it."""
     with subprocess.Popen([sys.executable, "-c", HOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                           cwd=Path(__file__).parents[2], start_new_session=True) as host:
         pid = int(host.stdout.readline())
         os.killpg(host.pid, how)
         said = host.stderr.read()
     assert host.returncode == -how
-    assert said.count(b"Traceback") == (how == signal.SIGINT)      # the host's own, and none of the process
+    assert said.count(b"Traceback") == (how == signal.SIGINT)      # only that of the host, none of the process
     for _ in range(1200):
         try:
             os.kill(pid, 0)

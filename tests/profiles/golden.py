@@ -1,19 +1,19 @@
-"""Golden exchanges: requests and replies worked out by hand from the manufacturers' documents, one file a profile.
+"""Golden exchanges: requests and replies derived by hand from the manufacturers' documents, one file per profile.
 
-No line of ``golden/*.yaml`` was made by running this project's code; the arithmetic stands beside each in a comment. A
-file says::
+No line of ``golden/*.yaml`` was made by running this project's code; a comment beside each has the calculation. A
+file contains::
 
     profile: vendor/model          as in --profile
     rated_torque_nm: 1000.0        what 100 % torque is in this file
-    limits: {...}                  what rig.yaml asks for, used by ``set``
-    told: {name: value}            parameters' values that the exchanges rest on, in the profile's units
-    filters_s: {speed: 0.0}        time constants that must come out, with ``told``
+    limits: {...}                  limits of rig.yaml, used by ``set``
+    told: {name: value}            values of parameters that the exchanges need, in the profile's units
+    filters_s: {speed: 0.0}        expected time constants, with ``told``
     exchanges:                     in this order, on one drive
       - does: what it is
         request: 06 0063 047E      the PDU in hex: function code and data, blanks where they help; no unit, no CRC
         reply: 06 0063 047E
         means: {...}               one of the kinds below
-        drive: same                what the simulated drive is asked, see there
+        drive: same                test of the simulated drive, see below
     cycles:                        whole cycles, in the order in which the driver sends them
       - does: what it is
         seen: 0x0237               status word of the cycle before
@@ -26,7 +26,7 @@ file says::
 Kinds of ``means``, one or more keys of one line:
 
 ``state``, ``remote``, ``limit_active``, ``standstill``   the status word in the reply
-``wish``, ``seen``, ``mode``, ``reverse``     the control word in the request, and the status that it answers to
+``wish``, ``seen``, ``mode``, ``reverse``     the control word in the request, and the status word before it
 ``write: speed | torque`` with ``speed_rad_s`` or ``torque_nm``      a setpoint in the request
 ``read: speed | torque`` with ``speed_rad_s`` or ``torque_nm``       feedback in the reply
 ``echo: speed | torque`` with ``speed_rad_s`` or ``torque_nm``       a setpoint as the drive shows it, in the reply
@@ -35,9 +35,9 @@ Kinds of ``means``, one or more keys of one line:
 ``choose: speed | torque``         the mode register in the request
 ``shows: speed | torque``          the mode display in the reply
 
-What ``drive`` asks of the simulated drive that wears the profile: ``same`` – the golden reply, byte for byte, in the
-state in which the exchanges before have left it; ``forced`` – the same, once the drive has been made to report that
-speed and torque; absent – nothing, since a status word like that takes more than words to bring about.
+Values of ``drive``, the test of the simulated drive with the profile: ``same`` – the golden reply, byte for byte, in
+the state after the exchanges before; ``forced`` – the same, with the reported speed and torque set by the test;
+absent – no test, since such a status word needs more than exchanges.
 """
 
 from functools import cache
@@ -52,12 +52,12 @@ from profiles.yaml_loader import load_model
 FOLDER = Path(__file__).parent / "golden"
 
 Pdu = Annotated[str, Field(pattern=r"^[0-9A-F ]+$")]
-ModeName = Literal["torque", "speed"]      # the order of the options: typing takes unions of both orders for one
+ModeName = Literal["torque", "speed"]      # the order of the options: typing considers unions of both orders equal
 Wish = Literal["off", "enabled", "quick_stop"]
 
 
 class Means(DataModel):
-    """What an exchange says, worked out by hand."""
+    """Meaning of an exchange, derived by hand."""
 
     state: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault", "fault_reaction"] | None = None
     remote: bool | None = None
@@ -112,7 +112,7 @@ class Cycle(DataModel):
 
 
 class Limits(DataModel):
-    """Of rig.yaml."""
+    """Limits of rig.yaml."""
 
     speed_rad_s: float
     torque_nm: float
@@ -121,7 +121,7 @@ class Limits(DataModel):
 
 
 class Golden(DataModel):
-    """One file."""
+    """One golden file."""
 
     profile: str
     rated_torque_nm: float
@@ -133,16 +133,16 @@ class Golden(DataModel):
 
 
 def pdu(text: str) -> bytes:
-    """Hex with blanks between bytes → bytes."""
+    """Convert hex with blanks between bytes to bytes."""
     return bytes.fromhex(text)
 
 
 def names() -> tuple[str, ...]:
-    """Stems of all files."""
+    """Return the stems of all files."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
 
 
 @cache
 def load(name: str) -> Golden:
-    """One of `names`, strictly."""
+    """Load one of `names`, strictly."""
     return load_model(FOLDER / f"{name}.yaml", Golden)

@@ -1,4 +1,4 @@
-"""What a CANopen profile may say beyond CiA 402's usual objects, and what is refused with the line it stands on."""
+"""CANopen profiles: entries beyond the usual objects of CiA 402, and refusals with their line."""
 
 from pathlib import Path
 
@@ -40,8 +40,8 @@ def test_wrong_profiles(tmp_path: Path, text: str, old: str, new: str, words: st
     assert all(problem.line for problem in caught.value.problems)
 
 
-def test_what_is_not_said_is_as_in_cia402() -> None:
-    """Profiles of before go on meaning what they meant."""
+def test_missing_entries_have_the_values_of_cia402() -> None:
+    """Older profiles keep their meaning."""
     profile = load_canopen_profile("generic/cia402")
     assert (profile.torque.rated.index, profile.torque.rated.type, profile.torque.actual) == (0x6076, "u32", None)
     assert profile.modes.mapped and profile.cyclic.has_period

@@ -1,6 +1,6 @@
-"""A profile begun from an EDS or DCF: what the file says, what it can't know, and files that are wrong or hostile.
+"""Profile from an EDS or DCF: content of the file, missing information, and wrong or hostile files.
 
-The files are written here, in the form of CiA 306; no maker's is in the repository.
+The files are written here, in the form of CiA 306. The repository contains no file of a manufacturer.
 """
 
 import math
@@ -36,7 +36,7 @@ INFO = {"VendorName": "Acme Drives", "VendorNumber": "0xAB", "ProductName": "Mov
 
 
 def eds(change=None, *, info=None, drop=(), extra="", values=None):
-    """The text of an EDS; ``values`` makes it a DCF."""
+    """Return the text of an EDS; ``values`` makes it a DCF."""
     objects = {key: value for key, value in (DRIVE | (change or {})).items() if key not in drop and key[0] not in drop}
     lines = ["[DeviceInfo]", *(f"{key}={value}" for key, value in (INFO | (info or {})).items())]
     for index in sorted({index for index, _ in objects}):
@@ -72,11 +72,11 @@ def refused(begin, text, name="drive.eds"):
     return caught.value.problems
 
 
-# -- what the file says ------------------------------------------------------------------------------------------------
+# -- content of the file ---------------------------------------------------------------------------------------------
 
 
-def test_our_own_eds_gives_the_generic_profiles_numbers(begin):
-    """What cia402.yaml says of the same drive, but for what no EDS can know."""
+def test_our_own_eds_gives_the_numbers_of_the_generic_profile(begin):
+    """The result equals cia402.yaml for the same drive, except for entries that no EDS contains."""
     ours = load_model(profile_path("generic/cia402"), CanopenProfile)
     begun = begin(OURS.read_text(encoding="utf-8")).profile
     for section, keys in (
@@ -93,7 +93,7 @@ def test_our_own_eds_gives_the_generic_profiles_numbers(begin):
     assert {"modes", "quick_stop", "torque", "watchdog"} <= set(begun.below("unverified"))
 
 
-def test_everything_that_is_open_is_unverified_and_says_where_to_look(begin):
+def test_every_open_entry_is_unverified_and_names_where_to_look(begin):
     begun = begin(eds())
     assert begun.profile.name == "acme-drives/mover-9"
     assert begun.profile.title == "Acme Drives Mover 9 (CANopen), from its EDS"
@@ -113,7 +113,7 @@ def test_everything_that_is_open_is_unverified_and_says_where_to_look(begin):
     ("0x00100300", 60.0 / (2.0 * math.pi)), ("0x00410300", 1.0 / 6.0), ("0xFF414700", 0.1 / 360.0),
 ])
 def test_the_unit_of_speed_by_60a9h(begin, unit, rpm):
-    """By CiA 303-2: 47h a minute, 03h a second, 10h a radian, 41h a degree; B4h a revolution; the prefix above."""
+    """CiA 303-2: 47h is a minute, 03h a second, 10h a radian, 41h a degree, B4h a revolution; the prefix is above."""
     profile = begin(eds({(0x60A9, 0): (U32, "rw", 0, unit)})).profile
     assert profile.speed.rpm_per_lsb == pytest.approx(rpm, rel=1e-10)
     assert profile.speed.si_unit == int(unit, 16)
@@ -123,7 +123,7 @@ def test_the_unit_of_speed_by_60a9h(begin, unit, rpm):
 
 @pytest.mark.parametrize("unit", ["0x00B54700", "0x00B44701", "0x00010300", "0x00000000", "0x7FB44700", ""])
 def test_a_unit_that_is_no_speed_of_a_shaft_is_left_open_and_no_ramp_written(begin, unit):
-    """A ramp in a wrong unit is a stop that lasts for minutes: a count of 6085h stays the drive's own."""
+    """A ramp in a wrong unit could make a stop last for minutes, so 6085h keeps the drive's value."""
     profile = begin(eds({(0x60A9, 0): (U32, "rw", 0, unit)})).profile
     assert profile.speed.confidence == "unverified"
     assert profile.speed.si_unit is None
@@ -133,7 +133,7 @@ def test_a_unit_that_is_no_speed_of_a_shaft_is_left_open_and_no_ramp_written(beg
 
 
 def test_encoder_counts_are_scaled_by_the_drives_own_objects(begin):
-    """Counts a second with 608Fh and 6094h: the same sum as siemens/s120-canopen has."""
+    """Counts per second with 608Fh and 6094h are calculated as in siemens/s120-canopen."""
     factors = {(0x608F, 1): (U32, "rw", 0, "8192"), (0x608F, 2): (U32, "rw", 0, "1"),
                (0x6094, 1): (U32, "rw", 0, "1"), (0x6094, 2): (U32, "rw", 0, "4")}
     begun = begin(eds(factors, drop=(0x60A9,)))
@@ -157,7 +157,7 @@ def test_encoder_counts_are_scaled_by_the_drives_own_objects(begin):
     ((0x6085,), "quick_stop", "deceleration_rpm_s_per_lsb", None, "by hand"),
     ((0x6502,), "modes", "torque", (10, 4), "no value of 6502h"),
 ])
-def test_an_object_that_is_missing_is_missed_in_words(begin, drop, section, key, value, words):
+def test_a_missing_object_is_reported_in_words(begin, drop, section, key, value, words):
     begun = begin(eds(drop=drop))
     assert getattr(getattr(begun.profile, section), key) == value
     assert words in " ".join(begun.text.replace("\n#", "").split())
@@ -173,12 +173,12 @@ def test_an_object_that_is_missing_is_missed_in_words(begin, drop, section, key,
     ({(0x6502, 0): (U32, "ro", 0, "0x0104")}, "modes", "speed", (9, 3)),
     ({(0x6502, 0): (U32, "ro", 0, "0x0A")}, "modes", "speed", (3,)),
 ])
-def test_another_type_or_no_access_counts_as_not_there(begin, change, section, key, value):
+def test_another_type_or_no_access_counts_as_missing(begin, change, section, key, value):
     assert getattr(getattr(begin(eds(change)).profile, section), key) == value
 
 
-def test_limits_of_the_file_count(begin):
-    """605Ah up to 2 and 6007h up to 1: neither 6 nor 3 is written to such a drive."""
+def test_limits_of_the_file_are_used(begin):
+    """With 605Ah up to 2 and 6007h up to 1, neither 6 nor 3 is written to such a drive."""
     text = eds().replace("[605A]\n", "[605A]\nHighLimit=2\n").replace("[6007]\n", "[6007]\nHighLimit=1\n")
     profile = begin(text).profile
     assert (profile.quick_stop.option_code, profile.quick_stop.ends) == (None, "off")
@@ -187,7 +187,7 @@ def test_limits_of_the_file_count(begin):
 
 @pytest.mark.parametrize(("drop", "modes"), [((0x60FF, 0x606C), "0x02"), ((), "0x22"), ((), "0x02"), ((0x60FF,), "")])
 def test_a_drive_with_velocity_mode_alone(begin, drop, modes):
-    """vl, usual for inverters' adapters: by 6502h, or because there is no 60FFh."""
+    """Velocity mode is usual for adapters of inverters. 6502h shows it, or a missing 60FFh."""
     change = {(0x6042, 0): (I16, "rw", 1, "0"), (0x6044, 0): (I16, "ro", 1, ""), (0x6502, 0): (U32, "ro", 0, modes),
               (0x604C, 1): (I32, "rw", 0, "1"), (0x604C, 2): (I32, "rw", 0, "10")}
     begun = begin(eds(change, drop=drop))
@@ -210,7 +210,7 @@ def test_torque_that_cannot_be_mapped_and_a_fixed_mapping_are_hints(begin):
     assert any("1600h can't be written" in hint for hint in profile.hints)
 
 
-def test_a_dcf_says_what_this_one_drive_is_set_to(begin):
+def test_a_dcf_contains_the_settings_of_one_drive(begin):
     text = eds(values={(0x60A9, 0): "0xFFB44700", (0x6076, 0): "512871", (0x6502, 0): "0x204"},
                extra="[DeviceComissioning]\nNodeID=17\nBaudrate=500\n")
     begun = begin(text, "drive.dcf")
@@ -222,7 +222,7 @@ def test_a_dcf_says_what_this_one_drive_is_set_to(begin):
     assert begun.profile.title.endswith("from its DCF")
 
 
-def test_a_maker_nobody_names(begin):
+def test_an_unnamed_manufacturer(begin):
     profile = begin(eds(info={"VendorNumber": "0", "VendorName": "", "ProductName": ""}, drop=(0x1018,))).profile
     assert profile.identity.vendor is None
     assert profile.identity.confidence == "unverified"
@@ -230,8 +230,10 @@ def test_a_maker_nobody_names(begin):
 
 
 def test_habits_of_real_files(begin):
-    """Latin-1, carriage returns, a byte-order mark, inline comments, keywords in other capitals, SUB for sub, indented
-    lines, a compact array, types of the maker's own, a $NODEID and sections that nobody needs."""
+    """The file has Latin-1, carriage returns, a byte-order mark, inline comments, and keywords in other capitals.
+
+    It also has SUB for sub, indented lines, a compact array, vendor types, a $NODEID and unused sections.
+"""
     text = eds(extra="[2000]\nParameterName=X\nDataType=0x0047\nAccessType=rw\n[40]\nParameterName=t\nObjectType=5\n"
                      "[1400]\nParameterName=r\nObjectType=9\n[1400sub1]\nParameterName=c\nDataType=7\nAccessType=rw\n"
                      "DefaultValue=$NODEID+0x200\n[1010]\nParameterName=s\nObjectType=8\nDataType=7\nAccessType=rw\n"
@@ -266,7 +268,7 @@ def line_of(text, start):
     ("DefaultValue=0x0000030C", "DefaultValue=0x30C0000000000000000000", "DefaultValue=0x30C0", "of 6502 is"),
     ("DefaultValue=480000", "DefaultValue=480000\nHighLimit=lots", "HighLimit", "HighLimit of 6076 is 'lots'"),
 ])
-def test_a_mistake_is_named_with_its_line(begin, old, new, at, words):
+def test_an_error_is_reported_with_its_line(begin, old, new, at, words):
     assert old in eds()
     text = eds().replace(old, new, 1)
     problems = refused(begin, text)
@@ -291,7 +293,7 @@ def test_a_mistake_is_named_with_its_line(begin, old, new, at, words):
     (eds(extra="[DeviceComissioning]\nNodeID=200\n"), "from 1 to 127"),
     ("x" * (8 * 1024 * 1024 + 1), "larger than"),
 ])
-def test_what_is_no_eds_of_a_drive(begin, text, words):
+def test_files_that_are_no_eds_of_a_drive(begin, text, words):
     assert any(words in str(problem) for problem in refused(begin, text))
 
 
@@ -316,7 +318,7 @@ def test_no_such_file_and_a_folder(tmp_path):
             read_eds(path)
 
 
-# -- files that mean harm, or are just broken --------------------------------------------------------------------------
+# -- hostile or damaged files --------------------------------------------------------------------------
 
 NASTY = st.text(
     alphabet=st.one_of(st.sampled_from("\"'\\:#{}[]&*!|>%@`,-?\t\x1b\u202e\u2028\ufeff=;"), st.characters()),
@@ -328,7 +330,7 @@ NASTY = st.text(
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(vendor=NASTY, product=NASTY, thing=NASTY)
 def test_no_name_breaks_out_of_the_profile(begin, vendor, product, thing):
-    """Whatever the names hold: the profile reads the same but for name and title, on lines that print."""
+    """With any names, the profile differs only in name and title, on printable lines."""
     def name(text):
         return " ".join(re.split(r"[\r\n\0]", text.encode("utf-8", "replace").decode()))
 
@@ -337,14 +339,14 @@ def test_no_name_breaks_out_of_the_profile(begin, vendor, product, thing):
     assert begun.profile.model_dump(exclude={"name", "title"}) == plain.profile.model_dump(exclude={"name", "title"})
     assert all(line.isprintable() for line in begun.text.splitlines())
     assert max(map(len, begun.text.splitlines())) < 250
-    assert "Zqx" not in begun.text                              # no text of the maker's but the two names
+    assert "Zqx" not in begun.text                              # only the two names are text of the manufacturer
 
 
 @pytest.mark.heavy
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_mutilated_file_is_refused_in_lines_or_gives_a_profile_that_loads(begin, tmp_path, data):
-    """Lines lost, doubled, cut, swapped, or with a sign in them changed: never anything but DataFileError."""
+    """Lines are lost, duplicated, truncated, swapped or changed. The only exception is DataFileError."""
     lines = eds().splitlines()
     for _ in range(data.draw(st.integers(1, 6))):
         at = data.draw(st.integers(0, len(lines) - 1))

@@ -1,4 +1,4 @@
-"""Golden exchanges against two readings of each profile: the driver's codec, and the simulated drive."""
+"""Golden exchanges, compared with both users of each profile: the codec of the driver, and the simulated drive."""
 
 import math
 from functools import cache
@@ -32,11 +32,11 @@ MODES = {"speed": Mode.SPEED, "torque": Mode.TORQUE}
 WISHES = {"off": PowerRequest.OFF, "enabled": PowerRequest.ENABLED, "quick_stop": PowerRequest.QUICK_STOP}
 
 
-worn = cache(load_modbus_profile)      # reading YAML strictly takes its time
+worn = cache(load_modbus_profile)      # strict YAML is slow to read
 
 
 class Script:
-    """A line on which exactly these requests are expected, and these replies come back."""
+    """Line that expects exactly these requests and returns these replies."""
 
     description = "script"
 
@@ -54,7 +54,7 @@ class Script:
 
 
 class Host:
-    """The driver's side: its codec, with the values that the file says are told."""
+    """Codec of the driver, with the stated values of the file."""
 
     def __init__(self, golden: Golden, *expected: tuple[bytes, bytes]) -> None:
         self.golden = golden
@@ -64,7 +64,7 @@ class Host:
             self.script, profile.line.unit, profile.line.word_order, frozenset(profile.cycle.functions)
         )
         scales = find_scales(profile, golden.told, golden.rated_torque_nm)
-        assert scales is not None, "the file doesn't tell every scale"
+        assert scales is not None, "the file does not contain every scale"
         self.plan = plan_cycle(profile)
         self.codec = Codec(profile, scales, has_demand=self.plan.has_demand)
 
@@ -87,7 +87,7 @@ def host_of(name: str, number: int) -> tuple[Host, Exchange]:
 
 
 @pytest.mark.parametrize(("name", "number"), CASES)
-def test_the_driver_sends_and_understands(name: str, number: int) -> None:
+def test_the_driver_encodes_and_decodes(name: str, number: int) -> None:
     host, exchange = host_of(name, number)
     means, profile, access = exchange.means, host.profile, host.access
     cycle, told = profile.cycle, host.golden.told
@@ -169,7 +169,7 @@ def test_filters(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_simulated_drive_answers(name: str) -> None:
+def test_the_simulated_drive_replies(name: str) -> None:
     golden = load(name)
     profile = worn(golden.profile)
     rig = QUIET_RIG
@@ -216,7 +216,7 @@ def test_every_profile_has_its_golden_exchanges() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_they_cover_what_a_profile_says(name: str) -> None:
+def test_they_cover_the_entries_of_a_profile(name: str) -> None:
     golden = load(name)
     profile = worn(golden.profile)
     all_of = [exchange.means for exchange in golden.exchanges]

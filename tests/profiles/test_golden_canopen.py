@@ -1,6 +1,6 @@
-"""Frames worked out by hand, against the driver that speaks them and the simulated drive that wears the profile.
+"""Frames derived by hand, compared with the driver and with the simulated drive with the profile.
 
-Both read the same profile, so a misreading of it could cancel itself out between them; these bytes it can't fool.
+Both read the same profile, so a common misreading could cancel. These bytes would still show it.
 """
 
 from pathlib import Path
@@ -21,12 +21,12 @@ GOLDEN = {path.stem: yaml.safe_load(path.read_text(encoding="utf-8")) for path i
 
 
 def data(text):
-    """'0f 00' or, where YAML takes it for a number, 75."""
+    """Return the bytes of '0f 00' or of 75, which YAML reads as a number."""
     return bytes.fromhex(str(text))
 
 
 class Swapped:
-    """A bus that puts other data into the drive's TPDO1."""
+    """Bus that replaces the data of the drive's TPDO1."""
 
     def __init__(self, bus):
         self.bus, self.channel_info, self.tpdo = bus, bus.channel_info, None
@@ -45,7 +45,7 @@ class Swapped:
 
 
 class Bench:
-    """Driver and simulated drive after preflight, every frame between them kept."""
+    """Driver and simulated drive after preflight, with every frame between them."""
 
     def __init__(self, golden):
         profile = load_canopen_profile(golden["profile"])
@@ -97,7 +97,7 @@ def test_every_canopen_profile_has_golden_frames():
     assert {entry["profile"] for entry in GOLDEN.values()} == canopen
 
 
-def test_preflight_says_these_and_hears_these(bench, golden):
+def test_preflight_sends_and_receives_these_frames(bench, golden):
     assert bench.found.refused == ()
     sent = [(frame.identifier, frame.data) for frame in bench.frames if frame.identifier in (0x601, 0x581)]
     for entry in golden["sdo"]:
@@ -106,15 +106,15 @@ def test_preflight_says_these_and_hears_these(bench, golden):
         assert sent[sent.index(request) + 1] == (0x581, data(entry["reply"])), entry["means"]
 
 
-def test_what_the_drive_has_not_is_not_there(bench, golden):
-    """SDO abort 06020000h, and the driver got by without it."""
+def test_missing_objects_of_the_drive_are_missing(bench, golden):
+    """The drive aborts with 06020000h, and the driver works without the object."""
     for index in golden.get("absent", ()):
         reply = bench.ask(bytes([0x40, index & 255, index >> 8, 0, 0, 0, 0, 0]))
         assert reply == bytes([0x80, index & 255, index >> 8, 0, 0x00, 0x00, 0x02, 0x06]), f"{index:04X}h"
 
 
 def test_guarding(bench, golden):
-    boot_up = b"\x00"              # heard as well if the node starts late
+    boot_up = b"\x00"              # also received if the node starts late
     answers = [frame.data for frame in bench.frames
                if frame.identifier == 0x701 and not frame.outgoing and frame.data != boot_up]
     asked = [frame.data for frame in bench.frames if frame.identifier == 0x701 and frame.outgoing]
@@ -131,7 +131,7 @@ def enabled(bench):
     raise AssertionError("not enabled")
 
 
-def test_the_driver_sends_these_setpoints_and_the_drive_understands_them(bench, golden):
+def test_the_driver_sends_these_setpoints_and_the_drive_decodes_them(bench, golden):
     enabled(bench)
     application = bench.node.application
     for entry in golden["rpdo1"]:
@@ -139,7 +139,7 @@ def test_the_driver_sends_these_setpoints_and_the_drive_understands_them(bench, 
         bench.drive.exchange(Command(Mode.SPEED, entry["speed_rad_s"], entry["torque_nm"] or 0.0))
         sent = [frame.data for frame in bench.frames[begin:] if frame.outgoing and frame.identifier == 0x201]
         assert sent == [data(entry["bytes"])], entry["means"]
-        # What it understood is what was meant, give or take half a count.
+        # The decoded value equals the setpoint within half a count.
         assert application.target_speed_rad_s == pytest.approx(
             entry["speed_rad_s"], abs=0.51 * bench.found.speed_resolution_rad_s
         ), entry["means"]
@@ -149,7 +149,7 @@ def test_the_driver_sends_these_setpoints_and_the_drive_understands_them(bench, 
             ), entry["means"]
 
 
-def test_the_driver_understands_this_feedback(bench, golden):
+def test_the_driver_decodes_this_feedback(bench, golden):
     enabled(bench)
     for entry in golden["tpdo1"]:
         bench.bus.tpdo = data(entry["bytes"])
@@ -159,8 +159,8 @@ def test_the_driver_understands_this_feedback(bench, golden):
         assert sample.speed_rad_s == pytest.approx(entry["speed_rad_s"], rel=1e-8), entry["means"]
 
 
-def test_the_simulated_drive_reports_so(bench, golden):
-    """The same numbers put into what it reports come out as these bytes, but for its own statusword."""
+def test_the_simulated_drive_reports_this_feedback(bench, golden):
+    """The same numbers in its reports give these bytes, except for its own statusword."""
     for entry in golden["tpdo1"]:
         reporting = bench.node.inverter.reporting
         reporting.torque_nm, reporting.speed_rad_s = entry["torque_nm"], entry["speed_rad_s"]
@@ -168,14 +168,14 @@ def test_the_simulated_drive_reports_so(bench, golden):
 
 
 def test_a_drive_behind_a_gateway_has_no_watchdog_and_is_refused(monkeypatch):
-    """Its own watches EtherCAT: nothing on the CAN side may pass for one; only by name it is taken."""
+    """Its watchdog supervises EtherCAT, so the CAN side has none. It is accepted by override only."""
     monkeypatch.setitem(GOLDEN["beckhoff-ax8000-gateway"]["limits"], "accept_no_watchdog", False)
     bench = Bench(GOLDEN["beckhoff-ax8000-gateway"])
     assert [check.name for check in bench.found.refused] == ["watchdog"]
     bench.close()
 
 
-def test_a_scaling_that_is_set_otherwise_is_refused():
+def test_a_scaling_with_another_setting_is_refused():
     golden = GOLDEN["beckhoff-ax8000-gateway"]
     bench = Bench(golden | {"stands": [{"index": 0x3005, "sub": 2, "value": 8448}]})
     assert [check.name for check in bench.found.refused] == ["3005h:02 Scaling index velocity NC"]

@@ -1,4 +1,4 @@
-"""Profiles that ship, and those of a user's own."""
+"""Shipped profiles, and profiles of the user."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def test_every_profile_that_ships_has_its_row_on_the_page(name: str) -> None:
     assert f"| `{name}`" in rows
 
 
-def test_generic_says_what_the_driver_needs() -> None:
+def test_generic_contains_the_entries_that_the_driver_needs() -> None:
     profile = load_profile("generic/cia402")
     assert profile.modes.speed == (9, 3)
     assert profile.modes.torque == (10, 4)
@@ -44,19 +44,19 @@ def test_profiles_are_frozen() -> None:
 
 
 @pytest.mark.parametrize("name", ["cia402", "generic/cia401", "Generic/cia402"])
-def test_unknown_name_lists_what_comes_close(name: str) -> None:
+def test_unknown_name_lists_similar_names(name: str) -> None:
     with pytest.raises(DataFileError, match="did you mean 'generic/cia402'"):
         load_profile(name)
 
 
 @pytest.mark.parametrize("name", ["", "../../etc/passwd", "generic", "a\nb", "x" * 5000])
-def test_names_reach_no_other_file(name: str) -> None:
+def test_names_access_no_other_file(name: str) -> None:
     with pytest.raises(DataFileError) as caught:
         load_profile(name)
     assert len(str(caught.value)) < 500
 
 
-def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
+def test_a_copy_of_generic_is_a_valid_profile(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(GENERIC.replace("generic/cia402", "mine/drive").replace("product: null", "product: 0x6552_0000"))
     with pytest.raises(DataFileError, match=r"mine\.yaml:\d+: identity\.product: must be a whole number"):

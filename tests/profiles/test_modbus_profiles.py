@@ -1,4 +1,4 @@
-"""Modbus profiles that ship: what each must say, and what a wrong one is told."""
+"""Shipped Modbus profiles: required entries, and messages for wrong ones."""
 
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ def text_of(name: str) -> str:
 
 
 def places(profile: ModbusProfile) -> list[tuple[str, Register]]:
-    """Every register with what stands there; the mode's is left out where another entry has it by right."""
+    """Return every register with its meaning; that of the mode is omitted if another entry rightly uses it."""
     cycle = profile.cycle
     found = [(f"cycle.{name}", getattr(cycle, name).register_)
              for name in ("control", "status", "speed_setpoint", "torque_setpoint", "speed", "torque", "torque_demand")
@@ -35,7 +35,7 @@ def places(profile: ModbusProfile) -> list[tuple[str, Register]]:
     return found
 
 
-def test_all_that_were_promised_ship() -> None:
+def test_all_promised_profiles_are_shipped() -> None:
     assert set(NAMES) <= set(profile_names())
 
 
@@ -64,7 +64,7 @@ def test_the_functions_reach_every_register_of_the_cycle(name: str) -> None:
         assert (3 if register.table == "holding" else 4) in functions, what
         assert register.count <= profile.cycle.largest_read
         if register.count == 2:
-            assert functions & {16, 23}, what          # or its halves would act one after the other
+            assert functions & {16, 23}, what          # otherwise its halves would act one after the other
     assert functions & {6, 16, 23}
     written = [getattr(profile.cycle, one).register_ for one in ("control", "speed_setpoint")]
     assert all(register.table == "holding" for register in written)
@@ -74,13 +74,13 @@ def test_the_functions_reach_every_register_of_the_cycle(name: str) -> None:
 def test_sources_are_stated(name: str) -> None:
     for entry, part in worn(name).entries():
         assert len(part.source) > 5, entry
-        # The word for second-hand knowledge must not stand beside the mark for first-hand knowledge.
+        # A source of second-hand knowledge must not be marked as verified.
         assert part.confidence != "verified" or "from memory" not in part.source, entry
         assert "facts.md" not in part.source
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_words_lead_from_off_to_enabled_and_no_word_is_two_wishes(name: str) -> None:
+def test_the_words_lead_from_off_to_enabled_and_each_word_is_one_request(name: str) -> None:
     control = worn(name).control
     onward = {state.means: state.onward for state in control.states if state.onward is not None}
     assert {"off", "enabled"} <= set(onward)
@@ -92,8 +92,8 @@ def test_the_words_lead_from_off_to_enabled_and_no_word_is_two_wishes(name: str)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_state_can_be_seen(name: str) -> None:
-    """No state hides behind one that stands before it in the list."""
+def test_each_state_can_be_decoded(name: str) -> None:
+    """An earlier state in the list must not mask a later one."""
     states = worn(name).control.states
     for number, state in enumerate(states):
         words = range(0x1_0000)
@@ -105,21 +105,21 @@ def test_each_state_can_be_seen(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_host_that_falls_silent_is_noticed(name: str) -> None:
+def test_every_profile_has_a_watchdog(name: str) -> None:
     profile = worn(name)
     watchdog = profile.watchdog
     assert watchdog.kind == "timeout"
     assert watchdog.parameter is not None
     time_out = profile.parameter(watchdog.parameter)
     assert time_out.unit == "s"
-    # Read, it must be above zero, which switches it off on all of these drives; written, it will be.
+    # A read value must be above zero, which is off on all these drives; a written value is above zero.
     assert time_out.set_to == "watchdog" or (time_out.require is not None and (time_out.require.at_least or 0.0) > 0.0)
     if watchdog.reaction_parameter is not None:
         assert profile.parameter(watchdog.reaction_parameter).require is not None
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_must_be_set_by_hand_says_how(name: str) -> None:
+def test_manual_settings_have_instructions(name: str) -> None:
     own_map = name == "generic/modbus"
     for parameter in worn(name).parameters:
         if parameter.require is not None and not own_map:
@@ -129,7 +129,7 @@ def test_what_must_be_set_by_hand_says_how(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_file_begins_with_what_is_special(name: str) -> None:
+def test_the_file_begins_with_its_particulars(name: str) -> None:
     head = text_of(name).split("\nname:")[0]
     assert head.startswith("#")
     if name != "generic/modbus":
@@ -157,7 +157,7 @@ def test_the_file_begins_with_what_is_special(name: str) -> None:
         ("register: {address: 113, ", "register: {address: 113, type: u16, ", "has no sign, and the setpoint"),
     ],
 )
-def test_wrong_profiles_are_told_with_file_and_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_wrong_profiles_are_reported_with_file_and_line(tmp_path: Path, old: str, new: str, words: str) -> None:
     text = text_of("siemens/g130-s120")
     assert old in text
     path = tmp_path / "mine.yaml"
@@ -170,26 +170,26 @@ def test_wrong_profiles_are_told_with_file_and_line(tmp_path: Path, old: str, ne
 
 
 def test_a_fault_reaction_is_not_a_fault(tmp_path: Path) -> None:
-    """CiA 402-2: in 000Fh the power stage is on. A profile from before says fault for both."""
+    """The power stage is on in 000Fh (CiA 402-2). An older profile has fault for both states."""
     path = tmp_path / "mine.yaml"
     path.write_text(text_of("generic/modbus").replace("means: fault_reaction", "means: fault"), encoding="utf-8")
     with pytest.raises(DataFileError, match="000Fh is fault reaction active"):
         load_modbus_profile(str(path))
 
 
-def test_an_echo_of_a_setpoint_that_is_not_there(tmp_path: Path) -> None:
+def test_an_echo_of_a_missing_setpoint(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(text_of("delta/ms300").replace("- setpoint: speed", "- setpoint: torque"), encoding="utf-8")
     with pytest.raises(DataFileError, match="this profile has no torque setpoint"):
         load_modbus_profile(str(path))
 
 
-def test_a_canopen_profile_is_not_taken_for_one() -> None:
+def test_a_canopen_profile_is_not_accepted_as_a_modbus_profile() -> None:
     with pytest.raises(DataFileError, match="is a profile for canopen"):
         load_modbus_profile("generic/cia402")
 
 
-def test_a_parameter_that_the_profile_has_not_is_an_error_of_the_tree() -> None:
+def test_an_unknown_parameter_is_an_error() -> None:
     profile = load_modbus_profile("generic/modbus")
     assert all(profile.parameter(one.name) is one for one in profile.parameters)
     with pytest.raises(UsageError, match="generic/modbus: the profile has no parameter 'nothing'"):

@@ -1,4 +1,4 @@
-"""Numbers with units, as manuals and people write them, and as messages show them."""
+"""Numbers with units, in the notations of manuals, users and messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from profiles import quantities as q
 
-# By hand, not by the table that is tested.
+# Derived by hand, not from the tested table.
 KNOWN = [
     ("100 rpm", q.SPEED, 100 * 2 * math.pi / 60), ("100rpm", q.SPEED, 10.471975511965978),
     ("100 1/min", q.SPEED, 10.471975511965978), ("100 min⁻¹", q.SPEED, 10.471975511965978),
@@ -49,14 +49,14 @@ def test_a_share_is_exact():
     ("1_000 rpm", q.SPEED), ("100-200 rpm", q.SPEED), ("1.5.2 s", q.TIME), ("rpm", q.SPEED), ("", q.SPEED),
     ("nan", q.SPEED), ("inf rpm", q.SPEED), ("1e999 rpm", q.SPEED), ("0x10 rpm", q.SPEED), ("9" * 400, q.SPEED),
 ])
-def test_what_could_mean_something_else_is_not_read(text, unit):
+def test_an_ambiguous_text_is_not_read(text, unit):
     with pytest.raises(ValueError) as caught:
         q.read(text, unit)
-    assert "write" not in str(caught.value)      # no number is offered: who wrote a unit meant it
+    assert "write" not in str(caught.value)      # no number is offered, since the stated unit was intended
 
 
 @pytest.mark.parametrize("text", ["0,5", "0,5 Hz", "1,000 Hz"])
-def test_a_comma_is_named_as_the_mistake(text):
+def test_a_comma_is_reported_as_the_error(text):
     with pytest.raises(ValueError, match="a decimal point and no comma"):
         q.read(text, q.FREQUENCY)
 
@@ -95,7 +95,7 @@ def test_keys_of_one_quantity():
 @pytest.mark.parametrize(("value", "text"), [
     (8.829e-12, "0"), (-3e-13, "0"), (20000.0, "20000"), (123456.0, "123500"), (0.00012345, "0.0001234"), (2.5, "2.5"),
 ])
-def test_a_number_without_an_interval_has_no_exponent_and_no_arithmetic_dust(value, text):
+def test_a_number_without_an_interval_has_no_exponent_and_no_rounding_errors(value, text):
     assert q.plain_number(value) == text
 
 

@@ -1,4 +1,4 @@
-"""The speed controller's part of a profile: what is read from the drive, and the parameters of its notch."""
+"""Speed controller in a profile: values read from the drive, and the parameters of its notch."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def test_the_standard_has_no_object_for_gains_so_they_are_those_of_the_simulated
     ("generic/cia402", load_canopen_profile, "  simulated_only: true\n", NOTCH + FREQUENCY + FREQUENCY,
      "frequency_hz stands there twice"),
 ])
-def test_wrong_entries_are_told_with_their_line(tmp_path, name, load, old, new, words) -> None:
+def test_wrong_entries_are_reported_with_their_line(tmp_path, name, load, old, new, words) -> None:
     text = Path(profile_path(name)).read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "mine.yaml"

@@ -1,4 +1,4 @@
-"""The strict loader: traps of YAML 1.1, all problems at once with their lines, and nothing but DataFileError."""
+"""Strict loader: pitfalls of YAML 1.1, all problems at once with their lines, and only DataFileError."""
 
 from pathlib import Path
 from typing import Literal
@@ -38,7 +38,7 @@ def refused(text: str) -> list[tuple[int, str]]:
 
 
 def test_a_file_of_another_kind_is_one_problem() -> None:
-    """Such as a result document, which has a drive and a profile too."""
+    """An example is a result document, which also has a drive and a profile."""
     foreign = "".join(f"key{number}: 1\n" for number in range(8))
     known = "a, b, n, options, part, parts, s"
     text = "a file of another kind: 8 of its {} keys are unknown; known here: " + known
@@ -50,7 +50,7 @@ def test_a_file_of_another_kind_is_one_problem() -> None:
         assert "must be a section" in refused(other)[0][1]
 
 
-def test_where_a_number_is_wanted_no_truth_value_is_advised() -> None:
+def test_no_boolean_is_advised_for_a_number() -> None:
     assert refused("a: yes") == [(1, "a: must be a number, not the text 'yes'")]
 
 
@@ -166,7 +166,7 @@ def test_many_problems_are_cut_short() -> None:
     assert "451 more" in found[-1][1]
 
 
-def test_billion_laughs_stops_at_its_first_alias() -> None:
+def test_nested_aliases_stop_at_the_first_alias() -> None:
     text = "a: &a [x, x]\n" + "".join(f"{n}: &{n} [*{p}, *{p}]\n" for p, n in zip("abcdefg", "bcdefgh", strict=True))
     assert any("alias" in message for _, message in refused(text))
 
@@ -190,7 +190,7 @@ def test_files_that_are_no_text(tmp_path: Path, content: bytes, line: int, words
     assert words in problem.message
 
 
-def test_files_that_are_not_there(tmp_path: Path) -> None:
+def test_missing_files(tmp_path: Path) -> None:
     with pytest.raises(DataFileError, match=r"none\.yaml: no such file"):
         load_model(tmp_path / "none.yaml", Whole)
     with pytest.raises(DataFileError, match="is a directory"):

@@ -1,4 +1,4 @@
-"""Samples, frames and whole runs for the tests of the log; seeded."""
+"""Seeded samples, frames and whole runs for the tests of the log."""
 
 import random
 from dataclasses import fields
@@ -63,7 +63,7 @@ def frames(cycle: int, rng: random.Random) -> list[RawFrame]:
 
 
 def fill(writer: RunWriter, builder: RecordingBuilder, cycles: int, seed: int = 1) -> list[RawFrame]:
-    """A run of so many cycles into both; the frames that were logged."""
+    """Write a run of this number of cycles into both; return the logged frames."""
     rng = random.Random(seed)
     logged = []
     builder.learn(**FACTS)
@@ -96,14 +96,14 @@ def make_run(path: Path, cycles: int = 1000, epoch_ns: int = 0) -> RecordingBuil
 
 
 def same_run(one: LoggedRun, other: LoggedRun) -> bool:
-    """Equal in all that was read, problems too; the recordings to the last bit."""
+    """Return whether all data and problems are equal, and the recordings bit for bit."""
     rest = [(field.name, repr(getattr(one, field.name)) == repr(getattr(other, field.name)))
             for field in fields(LoggedRun) if field.name != "recording"]
     return same(one.recording, other.recording) and all(equal for _, equal in rest)
 
 
 def same(one: Recording, other: Recording) -> bool:
-    """Equal to the last bit, NaN included."""
+    """Return whether both are equal bit for bit, NaN included."""
     for field in fields(Recording):
         a, b = getattr(one, field.name), getattr(other, field.name)
         if isinstance(a, np.ndarray):

@@ -1,7 +1,7 @@
-"""Chunks read at once, by numpy, against the same read message by message: the same to the bit, whatever they hold.
+"""Chunks read at once by numpy and message by message: the results are bit for bit the same for any content.
 
-Files are put together here record by record: what our writer writes, what another writer of the same messages may write
-(fields in another order, zeros left away, a field more), what none should.
+The files are built record by record: records of our writer, valid records of another writer of the same messages
+(other order of fields, zeros omitted, an additional field), and invalid records.
 """
 
 import random
@@ -57,7 +57,7 @@ def declaration(channel, topic, name):
 
 
 def ours(seed):
-    """As our writer lays it out; any bits in the numbers, NaN of every kind among them."""
+    """Return a sample in the layout of our writer, with any bits in the numbers, including every kind of NaN."""
     rng = random.Random(seed)
     one = sample(seed % 5000, rng)
     if seed % 7 == 0:
@@ -67,7 +67,7 @@ def ours(seed):
 
 
 def leaving_zeros_away(seed):
-    """As protobuf itself writes it: a speed of zero takes no room."""
+    """Return a sample as protobuf writes it, without the field of a zero speed."""
     parsed = CLASSES["Sample"].FromString(ours(seed))
     parsed.speed_rad_s = 0.0
     return parsed.SerializeToString()
@@ -83,7 +83,7 @@ def in_another_order(seed):
 
 
 def with_a_long_flag(seed):
-    """`fresh` as two bytes, and no status, so that it has the usual length but for one byte."""
+    """Return a sample with `fresh` as two bytes and no status: its length differs by one byte from the usual one."""
     payload = bytearray(ours(seed))
     payload[46] = 0x80
     return bytes(payload)
@@ -94,7 +94,7 @@ def of_the_right_length(seed):
 
 
 def with_the_angle_first(seed):
-    """Angle and torque demand the other way round, which protobuf reads all the same."""
+    """Return a sample with angle before torque demand, which protobuf accepts too."""
     payload = pack_sample(sample(15, random.Random(seed)))
     assert len(payload) == SAMPLE_SIZE + 2 * MORE_SIZE
     return payload[:SAMPLE_SIZE] + payload[-MORE_SIZE:] + payload[SAMPLE_SIZE:-MORE_SIZE]
@@ -137,7 +137,7 @@ def file_of(chunks, end=True):
 
 
 def both(path, data, batch=log_reader.BATCH):
-    """What both routes make of it, which must be the same; None where both refuse it."""
+    """Return the common result of both routes, or None if both refuse the file."""
     path.write_bytes(data)
     told = []
     for size in (batch, 0):
@@ -154,7 +154,7 @@ def both(path, data, batch=log_reader.BATCH):
 @FEW
 @given(raw=st.lists(CHUNKS, max_size=20), plain=st.integers(0, 30), packing=st.sampled_from(("zstd", "lz4", "")),
        damaged=st.sets(st.integers(0, 40), max_size=2), end=st.booleans(), batch=st.sampled_from((1, 3000, 2**21)))
-def test_the_two_routes_are_one(tmp_path, raw, plain, packing, damaged, end, batch):
+def test_both_routes_give_the_same(tmp_path, raw, plain, packing, damaged, end, batch):
     good = [b"".join(message(SAMPLE, ours(k), k) for k in range(n, n + 3)) for n in range(plain)]
     mixed = [one for pair in zip([*raw, *[b""] * plain], [*good, *[b""] * len(raw)], strict=True) for one in pair]
     both(tmp_path / "x.mcap",
@@ -163,7 +163,7 @@ def test_the_two_routes_are_one(tmp_path, raw, plain, packing, damaged, end, bat
 
 @pytest.mark.parametrize("writer", WRITERS[3:])
 def test_samples_laid_out_otherwise(tmp_path, writer):
-    """One such sample in fifty chunks: read by the other route, and as protobuf has it."""
+    """One such sample in fifty chunks is read by the other route, with the result of protobuf."""
     payloads = [[ours(3 * k + j) for j in range(3)] for k in range(50)]
     payloads[30][1] = writer(1234)
     found = both(tmp_path / "x.mcap", file_of([chunk(b"".join(message(SAMPLE, one) for one in few))
@@ -171,8 +171,8 @@ def test_samples_laid_out_otherwise(tmp_path, writer):
     assert len(found.recording.time_s) + len(found.problems) == 150
 
 
-def test_a_run_of_ours_goes_the_quick_way(tmp_path, monkeypatch):
-    """All but the first chunk, which declares the channels."""
+def test_a_run_of_our_writer_is_read_at_once(tmp_path, monkeypatch):
+    """All chunks are read at once, except for the first one, which declares the channels."""
     builder = make_run(tmp_path / "run.mcap", 2000)
     taken = []
     whole = log_reader._Reading._one_by_one
@@ -183,7 +183,7 @@ def test_a_run_of_ours_goes_the_quick_way(tmp_path, monkeypatch):
 
 
 def test_chunks_of_very_different_length(tmp_path):
-    """Walked in step while there are many, one by one when few are left."""
+    """They are read together while there are many, and singly when few are left."""
     rng = random.Random(5)
     sizes = [rng.choice((0, 1, 2, 300)) for _ in range(60)]
     found = both(tmp_path / "x.mcap", file_of([
@@ -192,7 +192,7 @@ def test_chunks_of_very_different_length(tmp_path):
     assert found.complete
 
 
-def test_enough_is_enough_on_both_routes(tmp_path, monkeypatch):
+def test_both_routes_stop_at_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(log_reader, "SAMPLES", 70)
     found = both(tmp_path / "x.mcap", file_of([
         chunk(b"".join(message(SAMPLE, ours(3 * k + j)) for j in range(3)) + message(EVENT, EVENTS))
@@ -202,7 +202,7 @@ def test_enough_is_enough_on_both_routes(tmp_path, monkeypatch):
 
 
 def test_the_layout_is_the_writer_s():
-    """The row of numpy is what `pack_sample` packs: field by field, for a sample of which no two bytes are alike."""
+    """The row of numpy equals the bytes of `pack_sample`, field by field, for a sample with distinct bytes."""
     one = sample(1, random.Random(1))._replace(torque_demand_nm=None, position_rad=None, time_s=0.1, status=0x1234)
     row = np.frombuffer(pack_sample(one), chunk_table._SAMPLE_ROW)[0]
     for name in ("time_s", "speed_rad_s", "torque_nm", "age_s", "half_width_s", "status"):

@@ -1,7 +1,7 @@
-"""Two hundred traces that no inertia can be had from: a typed error or a refusal each, never a number without reason.
+"""Two hundred traces without information on J: each gives a typed error or a refusal, and never a number.
 
-Each is a sound trace of a rigid shaft (or bytes that never were one), spoilt in one of many ways by a seed. With the
-excitation known, so that identification gets as far as it can.
+Each is a good trace of a rigid shaft (or random bytes) with one of many faults from a seed. The
+excitation is known, so that identification continues as far as possible.
 """
 
 import random
@@ -32,7 +32,7 @@ MOST_BYTES = 48 << 20
 
 
 def sound(seed):
-    """J 104 kg·m², B 8 N·m·s/rad, lags 0.4 and 0.15 s, two mean speeds; (N,) time, speed, torque."""
+    """Return time, speed, torque (N,) with J 104 kg·m², B 8 N·m·s/rad, lags 0.4 and 0.15 s, two mean speeds."""
     rng = np.random.default_rng(seed)
     t = np.arange(2 * PERIODS * PERIOD_S * RATE_HZ) / RATE_HZ
     offset = np.where(t < PERIODS * PERIOD_S, 4.0, 7.0)
@@ -48,7 +48,7 @@ def table(t, w, m):
     return HEAD + "".join(f"{a:.4f},{b:.6f},{c:.5f}\n" for a, b, c in zip(t, w, m, strict=True))
 
 
-# -- ways to spoil it ----------------------------------------------------------------------------------------
+# -- faults of a trace ------------------------------------------------------------------------------------------
 
 
 def flat_speed(t, w, m, rng):
@@ -155,7 +155,7 @@ SPOILT = (flat_speed, flat_torque, clipped_torque, clipped_speed, without_values
 
 
 def end(path, excitation, choices=USUAL, bench=None):
-    """How it ends: the error's exit code, or the identification; whatever else is raised is a mistake of ours."""
+    """Return the exit code of the error, or the identification. Any other exception is a bug."""
     try:
         recording, said = read_recording(path, choices, excitation, bench)
     except TdhilError as error:
@@ -166,7 +166,7 @@ def end(path, excitation, choices=USUAL, bench=None):
 
 
 def most_bytes(path):
-    """The peak of memory while a trace is read, or found unreadable."""
+    """Return the peak of memory while a trace is read or refused."""
     tracemalloc.start()
     try:
         with suppress(TdhilError):
@@ -184,7 +184,7 @@ def excitation(tmp_path_factory):
 
 
 @pytest.mark.heavy
-def test_the_sound_trace_is_identified(tmp_path, excitation):
+def test_the_good_trace_is_identified(tmp_path, excitation):
     path = tmp_path / "trace.csv"
     path.write_text(table(*sound(1)))
     found, said = end(path, excitation)
@@ -196,9 +196,9 @@ def test_the_sound_trace_is_identified(tmp_path, excitation):
 @pytest.mark.long(but_first=10)
 @pytest.mark.heavy
 @pytest.mark.parametrize("spoil", SPOILT, ids=lambda spoil: spoil.__name__)
-def test_a_spoilt_trace_gives_no_number(tmp_path, excitation, spoil):
+def test_a_faulty_trace_gives_no_number(tmp_path, excitation, spoil):
     path = tmp_path / "trace.csv"
-    for seed in range(2 if spoil is speed_for_torque else 10):       # that one alone gets as far as a fit
+    for seed in range(2 if spoil is speed_for_torque else 10):       # only this one reaches a fit
         content = spoil(*sound(seed), random.Random(seed))
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
         if seed == 0:
@@ -259,7 +259,7 @@ YAML_WRONG = {
 
 
 @pytest.mark.parametrize("keys", YAML_WRONG)
-def test_a_wrong_excitation_is_told_with_its_line(tmp_path, keys):
+def test_a_wrong_excitation_is_reported_with_its_line(tmp_path, keys):
     given_keys = dict(part.split(": ", 1) for part in keys.replace(", 0.1]", "; 0.1]").split(", "))
     defaults = {"start_s": "0.0", "period_s": "10.0", "offset_rad_s": "4.0", "lines_hz": "[0.1, 0.2]"}
     text = "segments:\n  - {" + ", ".join(f"{k}: {v}" for k, v in (defaults | given_keys).items()) + "}\n"

@@ -1,4 +1,4 @@
-"""Survey of a trace whose columns are not known yet: header, guess, and every mistake in a choice at once."""
+"""Survey of a trace with unknown columns: header, guess, and all errors of a choice at once."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_header_and_columns_are_found(tmp_path, text, line, guess):
     assert all(len(row) == len(found.names) == len(found.units) for row in found.rows)
 
 
-def test_a_setpoint_is_not_taken_for_the_reported_value(tmp_path):
+def test_a_setpoint_is_not_used_as_the_reported_value(tmp_path):
     found = survey(tmp_path, "t_s,n_set_rpm,n_act_rpm,m_set_nm,m_act_nm\n0,1,2,3,4\n1,2,3,4,5\n")
     assert [one.column for one in found.guess] == ["t_s", "n_act_rpm", "m_act_nm"]
 
@@ -60,12 +60,12 @@ def test_encodings_are_recognised(tmp_path, encoding):
     ("x\n1\n2\n", CsvUnusable, "no table"), ("1,2,3\n1,2,3\n", CsvMisnamed, "no header"), ("", CsvUnusable, "empty"),
     ("time_s,speed_rad_s,torque_nm\n", CsvUnusable, "no row of numbers"), ("\0\1\2" * 99, CsvUnusable, "neither text"),
 ])
-def test_what_is_no_table_says_so(tmp_path, text, kind, said):
+def test_a_file_without_a_table_is_reported(tmp_path, text, kind, said):
     with pytest.raises(kind, match=said):
         survey(tmp_path, text)
 
 
-def test_every_mistake_in_a_choice_is_named_at_its_quantity():
+def test_every_error_in_a_choice_is_reported_at_its_quantity():
     found = list(column_mistakes(["speed=n:furlong", "torque=m:%", "time=q"], ["t", "n", "m"], rated=False))
     assert [quantity for quantity, _ in found] == ["speed", "rated", "time"]
     assert list(column_mistakes(["time=t", "speed=n:rpm", "torque=n:Nm"], ["t", "n"], rated=False)) == [
@@ -83,7 +83,7 @@ any_choice = given(names=NAMES, items=st.lists(st.text(max_size=20), max_size=5)
 
 @settings(max_examples=10, deadline=None)
 @any_choice
-def test_no_choice_raises_and_a_right_one_has_no_mistake(names, items):
+def test_no_choice_raises_and_a_right_one_has_no_error(names, items):
     choose(names, items)
 
 

@@ -1,4 +1,4 @@
-"""Exports as drives' tools write them: each is read as what it says, or refused with one line that names the place."""
+"""Exports of drive tools: each is read with its stated meaning, or refused with one line that names the place."""
 
 import math
 
@@ -93,7 +93,7 @@ EXPORTS = {
 
 
 @pytest.mark.parametrize("name", EXPORTS)
-def test_an_export_is_read_as_what_it_says(tmp_path, name):
+def test_an_export_is_read_with_its_stated_meaning(tmp_path, name):
     text, encoding, columns, rated, times, speeds, torques, words = EXPORTS[name]
     path = tmp_path / "trace.csv"
     path.write_bytes(text.encode(encoding))
@@ -145,7 +145,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_can_t_be_read_is_refused_in_one_line(tmp_path, name):
+def test_an_unreadable_export_is_refused_in_one_line(tmp_path, name):
     content, columns, code, words = REFUSED[name]
     path = tmp_path / "trace.csv"
     path.write_text(content, encoding="utf-8")
@@ -160,7 +160,7 @@ def test_what_can_t_be_read_is_refused_in_one_line(tmp_path, name):
 
 @pytest.mark.parametrize("head", [b"PK\x03\x04....", b"\x1f\x8b\x08\x00", bytes(range(256)) * 20, b"\0" * 500,
                                   "time,speed,torque\n1,2,3\n".encode("utf-32")])
-def test_what_is_no_text_is_told(tmp_path, head):
+def test_a_file_that_is_no_text_is_reported(tmp_path, head):
     path = tmp_path / "trace.csv"
     path.write_bytes(head)
     with pytest.raises(CsvUnusable, match=r"no text|neither text"):
@@ -196,7 +196,7 @@ def test_files_rows_and_lines_have_a_limit(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("odd", ["", "200.5,NaN,1", "200.5,x,1", "200.5", '"200.5","1","2"'])
 def test_blocks_and_single_rows_read_alike(tmp_path, monkeypatch, odd):
-    """However the file is cut into blocks, and whether a block is read at once or row by row."""
+    """The result is the same for any block size, and for blocks read at once or row by row."""
     path = tmp_path / "trace.csv"
     rows = [f"{n},{n % 7}.25,{n % 5}" for n in range(400)]
     path.write_text("\n".join([HEAD.strip(), *rows[:201], odd, *rows[201:]]))
@@ -221,7 +221,7 @@ def test_times_of_day(cells, seconds):
     assert [reader.seconds(cell) for cell in cells] == [pytest.approx(s) if s is not None else None for s in seconds]
 
 
-def test_resolution_is_the_quantum_of_a_rounded_signal():
+def test_resolution_is_the_count_of_a_rounded_signal():
     wave = np.sin(np.linspace(0.0, 20.0, 5000))
     assert resolution(np.round(wave, 1) * RPM) == pytest.approx(0.1 * RPM)
     assert resolution(wave) < 1e-3

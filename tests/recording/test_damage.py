@@ -1,4 +1,4 @@
-"""Files that are cut, flipped, made to burst, or something else altogether."""
+"""Damaged logs: truncated files, flipped bits, decompression bombs, and files of other kinds."""
 
 import random
 import resource
@@ -34,7 +34,7 @@ def good(whole):
 
 
 def read_damaged(path, data):
-    """The run, or None where the file was refused; anything but a LogError is a failure."""
+    """Return the run, or None if the file is refused. Any other exception than LogError is a failure."""
     path.write_bytes(data)
     try:
         samples, frames = list(read_samples(path)), list(read_frames(path))
@@ -46,7 +46,7 @@ def read_damaged(path, data):
 
 
 def samples_left(path, data):
-    """Samples alone, where what else is left shows in the tests of any cut and of any flip."""
+    """Return the remaining samples only; the tests of cuts and flips check the rest."""
     path.write_bytes(data)
     return list(read_samples(path))
 
@@ -113,7 +113,7 @@ def test_flipped_bits(good, tmp_path, seed, flips):
 
 @pytest.mark.heavy
 def test_every_flip_in_the_heads_of_records(good, tmp_path):
-    """The lengths and kinds that hold the file together, bit by bit, around the third chunk and its indexes."""
+    """The test flips each bit of the lengths and kinds of records around the third chunk and its indexes."""
     data, _, samples, _ = good
     rng = random.Random(2)
     start = data.index(b"\x04\0\0\0zstd", 8000) - 37
@@ -128,7 +128,7 @@ def test_every_flip_in_the_heads_of_records(good, tmp_path):
         assert is_part(some, samples)
 
 
-def test_a_hole_in_the_middle_is_stepped_over(good, tmp_path):
+def test_a_gap_in_the_middle_is_skipped(good, tmp_path):
     data, _, samples, _ = good
     run, some, _ = read_damaged(tmp_path / "hole.mcap", data[:20_000] + bytes(5000) + data[25_000:])
     assert some[0].time_s == samples[0].time_s
@@ -140,7 +140,7 @@ def test_a_hole_in_the_middle_is_stepped_over(good, tmp_path):
 
 
 def test_the_first_chunk_lost_costs_only_itself(good, tmp_path):
-    """It declares the channels; a file of ours is read by their numbers all the same."""
+    """It declares the channels. A file of our writer can still be read by their numbers."""
     data, _, samples, _ = good
     damaged = bytearray(data)
     damaged[data.index(b"zstd") + 40] ^= 1
@@ -169,7 +169,7 @@ def test_missing_file_and_folder(tmp_path):
             read_run(path)
 
 
-def test_somebody_elses_mcap(tmp_path):
+def test_an_mcap_file_of_another_tool(tmp_path):
     with (tmp_path / "x.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -182,7 +182,7 @@ def test_somebody_elses_mcap(tmp_path):
 
 
 def _with_records(data, *records):
-    """A log with records of another tool before its first chunk, between two chunks, and before the end of its data."""
+    """Return a log with foreign records before its first chunk, between two chunks, and before the end of its data."""
     found = [one.offset for one in walk(BytesIO(data), len(data)) if isinstance(one, Contents)]
     end = data.rindex(struct.pack("<BQ", 0x0F, 4))
     for at in (end, found[len(found) // 2], found[0]):
@@ -245,7 +245,7 @@ def test_a_bomb_is_refused_in_little_memory(tmp_path, compression, declared):
 
 @pytest.mark.heavy
 def test_many_small_bombs_are_bounded_too(tmp_path):
-    """Chunks within the limit, full of what looks like empty samples: the sum is capped."""
+    """The chunks are within the limit and contain apparently empty samples. The sum is limited."""
     record = b"\x05" + (22).to_bytes(8, "little") + b"\x01\0" + bytes(20)
     chunk = record * (CHUNK // len(record))
     builder = RecordBuilder()

@@ -1,4 +1,4 @@
-"""Logs for others: events as viewers know them, a layout for them, frames and samples in other programs' formats."""
+"""Export of logs: events and layout for viewers, and frames and samples in formats of other programs."""
 
 import csv
 import json
@@ -38,7 +38,7 @@ def decoded(path, topic):
                 for schema, _, message, content in reader.iter_decoded_messages(topics=[topic])]
 
 
-def test_events_are_a_log_that_viewers_know(tmp_path):
+def test_events_are_a_log_for_viewers(tmp_path):
     path = tmp_path / "run.mcap"
     with RunWriter(path, epoch_ns=EPOCH_NS, block=True) as writer:
         for time_s, kind in ((0.5, "plan"), (1.25, "failure"), (2.0, "bus")):
@@ -50,7 +50,7 @@ def test_events_are_a_log_that_viewers_know(tmp_path):
     for _, log_time, one in found:
         assert 10**9 * one.timestamp.seconds + one.timestamp.nanos == log_time
     assert type(found[0][2]).DESCRIPTOR.fields_by_name["level"].enum_type.full_name == "foxglove.Log.Level"
-    assert [event.kind for event in read_run(path).events] == ["plan", "failure", "bus"]      # once, by us
+    assert [event.kind for event in read_run(path).events] == ["plan", "failure", "bus"]      # once, by tdhil
 
 
 def test_a_rehearsal_is_marked_once_for_viewers(tmp_path):
@@ -68,7 +68,7 @@ def test_a_rehearsal_is_marked_once_for_viewers(tmp_path):
     assert [event.kind for event in read_run(path).events] == ["plan"]
 
 
-def test_the_frequency_response_is_arrays_that_viewers_plot(tmp_path):
+def test_the_frequency_response_is_in_arrays_for_viewers(tmp_path):
     path = tmp_path / "run.mcap"
 
     def estimate(value):
@@ -86,10 +86,10 @@ def test_the_frequency_response_is_arrays_that_viewers_plot(tmp_path):
     assert list(found.hertz) == [0.1, 0.2] and list(found.magnitude) == [10.0, 5.0]
     assert list(found.magnitude_low) == [9.0, 4.5] and all(math.isnan(one) for one in found.magnitude_high)
     assert found.distortion_detected
-    assert read_run(path).result == document           # what is read back is the document
+    assert read_run(path).result == document           # the read-back data are the document
 
 
-def test_modbus_bytes_stand_on_their_own_topic(tmp_path):
+def test_modbus_bytes_have_their_own_topic(tmp_path):
     path = tmp_path / "run.mcap"
     with RunWriter(path, epoch_ns=0, block=True, frames=MODBUS) as writer:
         logged = fill(writer, RecordingBuilder(), 50)
@@ -98,9 +98,9 @@ def test_modbus_bytes_stand_on_their_own_topic(tmp_path):
     assert list(read_frames(path)) == logged
 
 
-def test_a_log_tells_when_it_began(log, tmp_path):
+def test_a_log_contains_its_start_time(log, tmp_path):
     assert read_run(log).epoch_ns == EPOCH_NS
-    make_run(tmp_path / "old.mcap", 10, 0)          # as stepped runs were logged before
+    make_run(tmp_path / "old.mcap", 10, 0)          # as in older logs of stepped runs
     assert read_run(tmp_path / "old.mcap").epoch_ns == 0
 
 
@@ -156,7 +156,7 @@ def test_samples_as_parquet(log, tmp_path):
         assert list(table[name]) == [getattr(one, name) for one in samples]
 
 
-def test_what_is_missing_is_said_in_one_line(log, tmp_path, capsys, monkeypatch):
+def test_missing_data_are_reported_in_one_line(log, tmp_path, capsys, monkeypatch):
     there = tmp_path / "there.csv"
     there.write_text("mine")
     monkeypatch.setitem(sys.modules, "duckdb", None)
@@ -179,7 +179,7 @@ def test_what_is_missing_is_said_in_one_line(log, tmp_path, capsys, monkeypatch)
     assert not (tmp_path / "b").exists()
 
 
-def test_a_log_that_was_cut_gives_what_it_has(log, tmp_path, capsys):
+def test_a_truncated_log_exports_its_data(log, tmp_path, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(log.read_bytes()[:-9000])
     assert main(["export", str(cut), "--to", "csv"]) == 3
@@ -187,7 +187,7 @@ def test_a_log_that_was_cut_gives_what_it_has(log, tmp_path, capsys):
     assert "cut or damaged" in capsys.readouterr().err
 
 
-def test_the_layout_names_what_a_log_holds():
+def test_the_layout_names_the_topics_of_a_log():
     layout = json.loads(LAYOUT.read_text(encoding="utf-8"))
     panels = layout["configById"]
     known = {topic: CLASSES[message].DESCRIPTOR.fields_by_name for topic, message in CHANNELS.values()}

@@ -1,4 +1,4 @@
-"""The disk runs full in mid-run, of the whole command: the shaft comes to rest, and what was written is there."""
+"""Full disk during a run of the whole command: the shaft comes to standstill, and the written data are kept."""
 
 import json
 import resource
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def identify(log, room):
-    """The command, whose files may grow to ``room`` bytes and no further."""
+    """Run the command with a limit of ``room`` bytes for its files."""
     def cap():
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
@@ -24,7 +24,7 @@ def identify(log, room):
 
 
 @pytest.mark.heavy
-def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):
+def test_a_log_that_fails_during_a_run_stops_the_shaft(tmp_path):
     done = identify(tmp_path / "run.mcap", 100_000)
     said = json.loads(done.stdout)
     assert (done.returncode, said["exit_code"]) == (3, 3), done.stderr
@@ -46,7 +46,7 @@ def test_a_disk_without_room_refuses_the_run(tmp_path):
 
 
 @pytest.mark.heavy
-def test_a_disk_that_fails_at_the_very_end_does_not_take_the_result_with_it(tmp_path, monkeypatch, capsys):
+def test_a_disk_that_fails_at_the_end_does_not_lose_the_result(tmp_path, monkeypatch, capsys):
     from tdhil.cli.main import main
     from tdhil.errors import LogBroken
     from tdhil.recording.log_writer import RunWriter

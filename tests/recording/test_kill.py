@@ -1,4 +1,4 @@
-"""SIGKILL in mid-run: the log reads, and what is missing is at most its last half second."""
+"""SIGKILL during a run: the log is readable, and at most its last half second is missing."""
 
 import signal
 import subprocess
@@ -44,7 +44,7 @@ def run_and_kill(path, after_s, script=REAL_TIME):
         if last_s >= after_s:
             child.send_signal(signal.SIGKILL)
             break
-    rest = child.stdout.read().split("\n")[:-1]    # what it had printed by the time it died
+    rest = child.stdout.read().split("\n")[:-1]    # its output up to the kill
     child.stdout.close()
     assert child.wait() == -signal.SIGKILL
     return float(rest[-1]) if rest else last_s
@@ -58,7 +58,7 @@ def test_a_killed_run_is_replayed_up_to_its_last_half_second(tmp_path):
         assert not run.complete
         assert not run.recording.complete
         time_s = run.recording.time_s
-        assert last_s - time_s[-1] <= 0.5 + 0.1    # a loaded machine may keep the thread waiting a little
+        assert last_s - time_s[-1] <= 0.5 + 0.1    # a loaded computer may delay the thread a little
         np.testing.assert_array_equal(time_s, np.arange(len(time_s)) * 0.004)
         assert (run.configuration, run.result) == (CONFIGURATION, None)
         assert (run.recording.gear_ratio, run.recording.levels) == (3.0, LEVELS)
@@ -66,8 +66,8 @@ def test_a_killed_run_is_replayed_up_to_its_last_half_second(tmp_path):
 
 
 @pytest.mark.heavy
-def test_in_stepped_time_the_queue_bounds_what_a_kill_costs(tmp_path):
-    """Four records a cycle: 0.26 s of control time in the queue, 0.4 s in the open chunk, whatever the wall says."""
+def test_in_stepped_time_the_queue_bounds_the_loss_by_a_kill(tmp_path):
+    """Four records per cycle give 0.26 s of control time in the queue and 0.4 s in the open chunk."""
     last_s = run_and_kill(tmp_path / "run.mcap", 20.0, STEPPED)
     time_s = read_run(tmp_path / "run.mcap").recording.time_s
     assert last_s - time_s[-1] <= 256 / 4 * 0.004 + 0.4 + 0.02
@@ -77,7 +77,7 @@ def test_in_stepped_time_the_queue_bounds_what_a_kill_costs(tmp_path):
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("cycle_s", [0.001, 0.004, 0.1])
 def test_in_stepped_time_the_default_queue_keeps_to_half_a_second_too(tmp_path, cycle_s):
-    """Whatever the rate: at 10 Hz the queue alone could hold minutes. One cycle may be printed and not yet taken."""
+    """The queue alone could contain minutes at 10 Hz. One cycle may be printed and not yet queued."""
     script = STEPPED.replace("queue_size=256", "queue_size=None").replace("0.004", str(cycle_s))
     first = f"from tests.recording import log_runs; log_runs.PERIOD_S = {cycle_s}\n"
     script = script.replace("from tests.recording", f"{first}from tests.recording")

@@ -1,4 +1,4 @@
-"""The hand-laid messages against protobuf's own reading of them."""
+"""Messages encoded by hand, compared with their decoding by protobuf."""
 
 import struct
 
@@ -64,7 +64,7 @@ def test_frames(frames):
 
 
 def leftovers(message, packed):
-    """Bytes that protobuf took for fields it doesn't know."""
+    """Return the bytes of fields unknown to protobuf."""
     before = message.ByteSize()
     message.DiscardUnknownFields()
     return before - message.ByteSize() or len(packed) < before
@@ -76,7 +76,7 @@ def test_numbers_out_of_range_are_refused():
 
 
 def test_field_numbers_of_old_files_are_kept():
-    """Fields are added at the end: a log of today is read by what comes after."""
+    """New fields are added at the end, so that later releases read a log of today."""
     assert list(MESSAGES["Sample"])[:13] == [
         "time_s", "speed_rad_s", "torque_nm", "age_s", "half_width_s", "fresh", "limit_active", "standstill",
         "state", "mode", "status", "torque_demand_nm", "position_rad"]

@@ -1,4 +1,4 @@
-"""A growing log, read from beside: everything once, in order, whenever one looks."""
+"""Growing log, read by another process: each record once, in order, at any time of reading."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_file_that_grows_byte_by_byte_is_read_like_a_whole_one(tmp_path):
     data, growing = (tmp_path / "whole.mcap").read_bytes(), tmp_path / "run.mcap"
     whole = read_run(tmp_path / "whole.mcap")
     tail, dice, written = LogTail(growing), random.Random(3), 0
-    assert not len(tail.read().samples)        # it isn't there yet
+    assert not len(tail.read().samples)        # the file does not exist yet
     seen, events, stages, last = [], [], [], {}
     with growing.open("wb", buffering=0) as file:
         while written < len(data):
@@ -89,7 +89,7 @@ def test_a_changed_byte_costs_its_chunk_at_most(tmp_path, place):
     assert set(samples[:, 0]) <= set(whole.recording.time_s)
 
 
-def test_who_comes_late_gets_it_in_pieces(tmp_path, monkeypatch):
+def test_a_late_reader_gets_the_log_in_parts(tmp_path, monkeypatch):
     write(tmp_path / "run.mcap")
     monkeypatch.setattr(log_tail, "MOST", 500)
     tail = LogTail(tmp_path / "run.mcap")

@@ -1,4 +1,4 @@
-"""`tdhil recover`: what it finds in whole, cut, damaged and hopeless files, and the copy that it writes."""
+"""`tdhil recover`: findings in complete, truncated, damaged and unreadable files, and the written copy."""
 
 import json
 import os
@@ -58,10 +58,10 @@ def test_a_log_cut_short(data, tmp_path, capsys):
                             "not closed"]
     assert 100 < said["samples"] < 900
     with (tmp_path / "copy.mcap").open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)         # mcap's own, by the index that the broken file lacked
+        reader = make_reader(file, validate_crcs=True)         # mcap's reader, by the index that was missing
         assert len(list(reader.iter_messages(topics=["/sample"]))) == said["samples"]
     run = read_run(tmp_path / "copy.mcap")
-    assert not run.complete                                    # the file is whole, the run that it shows is not
+    assert not run.complete                                    # the file is complete, the run is not
     assert not run.recording.complete
     assert [event.kind for event in run.events] == [RECOVERED]
     assert "not closed" in run.problems[0]
@@ -83,7 +83,7 @@ def test_in_words(data, tmp_path, capsys):
 @pytest.mark.heavy
 @SOME
 @given(seed=st.integers(0, 2**32), share=st.floats(0.01, 1.0), flips=st.integers(0, 6))
-def test_a_copy_holds_exactly_what_the_damaged_file_gives(data, tmp_path, seed, share, flips):
+def test_a_copy_contains_exactly_the_readable_data(data, tmp_path, seed, share, flips):
     rng, damaged = random.Random(seed), bytearray(data[:int(share * len(data))])
     for _ in range(flips):
         damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
@@ -93,7 +93,7 @@ def test_a_copy_holds_exactly_what_the_damaged_file_gives(data, tmp_path, seed, 
         found = examine(broken)
     except LogError as error:
         assert error.exit_code == 10
-        assert len(damaged) < 5000 * (flips + 2)       # not a chunk without a hit or a cut
+        assert len(damaged) < 5000 * (flips + 2)       # each chunk is damaged or truncated
         return
     write_copy(broken, target, found)
     with target.open("rb") as file:
@@ -109,7 +109,7 @@ def test_a_copy_holds_exactly_what_the_damaged_file_gives(data, tmp_path, seed, 
 
 @pytest.mark.parametrize("hit", [4, 20, 40, 3000])
 def test_a_damaged_head_is_no_obstacle(data, tmp_path, capsys, hit):
-    """Not even where the chunk that declares the channels is gone with it; it holds no sample yet."""
+    """The chunk that declares the channels may be lost too; it contains no sample."""
     (tmp_path / "broken.mcap").write_bytes(bytes(hit) + data[hit:])
     code, said = recover(capsys, tmp_path / "broken.mcap")
     assert (code, said["samples"] > 900) == (3, True)
@@ -125,7 +125,7 @@ def test_nothing_recoverable(content, tmp_path, capsys):
     assert not (tmp_path / "copy.mcap").exists()
 
 
-def test_never_over_the_log_itself(data, tmp_path, capsys):
+def test_the_log_itself_is_never_overwritten(data, tmp_path, capsys):
     log, link, hard = (tmp_path / name for name in ("run.mcap", "link.mcap", "hard.mcap"))
     log.write_bytes(data)
     link.symlink_to(log)
@@ -168,8 +168,8 @@ def test_a_killed_run_of_a_known_length(tmp_path):
     assert found.gaps == ()
 
 
-def test_a_damaged_name_and_a_damaged_first_chunk_cost_neither_all(data, tmp_path, capsys):
-    """Who wrote it is not to be read, and neither is which channel is which."""
+def test_with_a_damaged_name_and_first_chunk_the_rest_is_recovered(data, tmp_path, capsys):
+    """Neither the writer nor the meaning of the channels can be read."""
     damaged = bytearray(data)
     damaged[data.index(b"tdhil 0.")] ^= 4
     damaged[data.index(b"zstd") + 200] ^= 1

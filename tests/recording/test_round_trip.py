@@ -1,4 +1,4 @@
-"""What goes in comes out, to the last bit, for us and for MCAP's own reader."""
+"""Round trip of a log, bit for bit, with tdhil's reader and with MCAP's own reader."""
 
 import math
 import random
@@ -27,7 +27,7 @@ from tests.recording.log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STA
 from tests.recording.test_log_messages import SAMPLES
 
 
-def test_a_run_comes_back_as_it_was(tmp_path):
+def test_a_run_survives_a_round_trip(tmp_path):
     path, builder = tmp_path / "run.mcap", RecordingBuilder()
     with RunWriter(path, epoch_ns=0, block=True) as writer:
         logged = fill(writer, builder, 700)
@@ -75,7 +75,7 @@ def test_every_fact_of_a_recording_is_kept():
 
 @pytest.mark.parametrize("batch", [0, 2 * 2**20])
 def test_torque_setpoints_are_those_of_the_sample_s_own_command(tmp_path, batch):
-    """Only with the drive enabled and in torque mode; a sample whose command is lost has none."""
+    """They exist only in torque mode with an enabled drive. A sample with a lost command has none."""
     path, builder, rng = tmp_path / "run.mcap", RecordingBuilder(), random.Random(4)
     with RunWriter(path, epoch_ns=0, block=True) as writer:
         log = [(Command(rng.choice(list(Mode)), 1.0, rng.gauss(50.0, 9.0), rng.choice((0.0, 2.5))), sample(k, rng))
@@ -98,8 +98,8 @@ def test_torque_setpoints_are_those_of_the_sample_s_own_command(tmp_path, batch)
             recording.demanded_torque_nm[k])
 
 
-def test_angles_stand_where_they_came(tmp_path):
-    """NaN in the samples that brought none; live, replayed and packed alike."""
+def test_angles_are_in_the_samples_that_had_one(tmp_path):
+    """Samples without an angle have NaN, live, replayed and packed."""
     path = tmp_path / "run.mcap"
     builder = make_run(path, 700)
     position_rad = read_run(path).recording.position_rad
@@ -115,7 +115,7 @@ def test_angles_stand_where_they_came(tmp_path):
 
 
 def test_a_log_without_angles_has_none(tmp_path):
-    """As all logs of older releases: this one is from before there was the field."""
+    """This log is from a release before this field existed."""
     old = read_run(Path(__file__).parents[1] / "fuzz" / "corpus" / "mcap" / "valid_run.mcap")
     assert len(old.recording.time_s) > 0
     assert old.recording.position_rad is None
@@ -125,7 +125,7 @@ def test_a_log_without_angles_has_none(tmp_path):
     assert kept is not None and kept[0].position_rad is None
 
 
-def test_what_is_left_of_an_aborted_run_has_its_angles_and_setpoints(tmp_path):
+def test_the_rest_of_an_aborted_run_has_its_angles_and_setpoints(tmp_path):
     builder = RecordingBuilder()
     for cycle in range(1000):
         builder.add(sample(cycle, random.Random(cycle)), Command(Mode.TORQUE, 3.0, 100.0))
@@ -149,7 +149,7 @@ def test_a_fact_that_no_recording_has_is_refused():
         RecordingBuilder().learn(speed_of_light=1)
 
 
-def test_collecting_goes_on_after_a_recording_was_taken():
+def test_collecting_continues_after_a_recording_was_taken():
     builder, rng = RecordingBuilder(), random.Random(3)
     builder.add(sample(0, rng))
     first = builder.recording()
@@ -190,7 +190,7 @@ def test_a_simulated_run_repeats_in_content(tmp_path):
 
 
 @pytest.mark.parametrize("time_s", [math.nan, math.inf, -5.0, 1e300])
-def test_a_time_that_is_none_is_logged_at_the_one_before(tmp_path, time_s):
+def test_an_invalid_time_is_logged_as_the_one_before(tmp_path, time_s):
     path, rng = tmp_path / "run.mcap", random.Random(5)
     with RunWriter(path, epoch_ns=0, block=True) as writer:
         writer.sample(sample(100, rng))
@@ -202,7 +202,7 @@ def test_a_time_that_is_none_is_logged_at_the_one_before(tmp_path, time_s):
     assert read_run(path).events[0].text == "odd ? name"
 
 
-def test_a_virtual_string_comes_back_bit_for_bit(tmp_path):
+def test_a_virtual_string_survives_a_round_trip_bit_for_bit(tmp_path):
     rng = random.Random(4)
     rows = [(PERIOD_S * cycle, *(rng.gauss(0.0, 1e3) for _ in VIRTUAL_COLUMNS[1:])) for cycle in range(700)]
     path = tmp_path / "virtual.mcap"

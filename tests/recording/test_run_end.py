@@ -1,4 +1,4 @@
-"""What ended a run stands in its log in typed fields; in older logs, which have an event only, it is found too."""
+"""End of a run in its log: typed fields, or the event of older logs."""
 
 import signal
 
@@ -24,7 +24,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=repr)
-def test_it_comes_back(tmp_path, error):
+def test_the_cause_survives_a_round_trip(tmp_path, error):
     log = RunLog(RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True), {"options": {}})
     log.failure(3.5, error)
     log.close()
@@ -39,10 +39,10 @@ def test_it_comes_back(tmp_path, error):
     assert run.events[0].kind == ("interrupted" if isinstance(error, Interrupted) else "failure")
 
 
-def test_a_run_that_went_to_its_end_has_none():
+def test_a_complete_run_has_no_cause():
     assert find_ended({}, (Event(0.0, "plan", "failure is no word of ours"),)) is None
 
 
 @pytest.mark.parametrize("ended", [{}, {"exit_code": "x", "time_s": None}, {"kind": 3, "exit_code": 77}, [], "text"])
-def test_a_hostile_one_is_no_trouble(ended):
+def test_hostile_fields_are_harmless(ended):
     find_ended({"ended": ended}, ())

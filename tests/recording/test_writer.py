@@ -1,4 +1,4 @@
-"""The front, the queue, the thread, and disks that are slow, full or gone."""
+"""Log writer: interface, queue, thread, and disks that are slow, full or lost."""
 
 import errno
 import io
@@ -23,11 +23,11 @@ from tdhil.recording.run_log import RunLog
 from tests.recording.log_runs import RESULT, fill, frames, make_run, sample
 
 HANGS_S = 60.0
-"""Wall time after which something is taken to hang."""
+"""Wall time after which a call is considered hung."""
 
 
 class Disk(io.FileIO):
-    """A file that stands still while its gate is shut, and is full after so many bytes."""
+    """File whose writes block while its gate is closed, and which is full after a number of bytes."""
 
     def __init__(self, path, room=10**9):
         super().__init__(path, "wb")
@@ -86,7 +86,7 @@ def test_a_full_queue_drops_in_real_time_and_says_so(tmp_path):
     assert "warning" in [event.kind for event in run.events]
 
 
-def test_a_full_disk_is_said_once_and_the_rest_is_whole(tmp_path):
+def test_a_full_disk_is_reported_once_and_the_rest_is_complete(tmp_path):
     path, rng = tmp_path / "run.mcap", random.Random(1)
     disk = Disk(path, room=60_000)
     writer = RunWriter(path, epoch_ns=0, block=True, opener=lambda _: disk)
@@ -118,7 +118,7 @@ def test_a_full_disk_while_closing_leaves_the_samples(tmp_path):
     assert (len(run.recording.time_s), run.complete, repr(run.result)) == (500, False, repr(RESULT))
 
 
-def test_the_first_error_stays_the_first(tmp_path):
+def test_the_first_error_is_kept(tmp_path):
     disk = Disk(tmp_path / "run.mcap", room=1000)
     writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk)
     with pytest.raises(KeyError), writer:
@@ -152,7 +152,7 @@ def test_paths_that_cannot_be_written(tmp_path):
         RunWriter(tmp_path / "old.mcap", epoch_ns=0, block=True, overwrite=False)
 
 
-def test_what_is_no_json_is_refused_where_it_is_handed_in(tmp_path):
+def test_a_value_that_is_no_json_is_refused_at_the_call(tmp_path):
     with RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True) as writer:
         with pytest.raises(LogError, match="JSON"):
             writer.result({"a": object()})
@@ -161,7 +161,7 @@ def test_what_is_no_json_is_refused_where_it_is_handed_in(tmp_path):
     assert read_run(tmp_path / "run.mcap").complete
 
 
-def test_after_close_nothing_is_taken_and_nothing_raised(tmp_path):
+def test_after_close_records_are_ignored_without_an_exception(tmp_path):
     writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True)
     writer.close()
     writer.sample(sample(0, random.Random(1)))
@@ -171,7 +171,7 @@ def test_after_close_nothing_is_taken_and_nothing_raised(tmp_path):
     assert list(read_samples(tmp_path / "run.mcap")) == []
 
 
-def test_close_does_not_wait_for_ever(tmp_path):
+def test_close_waits_for_a_bounded_time(tmp_path):
     disk = Disk(tmp_path / "run.mcap")
     writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk)
     disk.gate.clear()
@@ -182,17 +182,17 @@ def test_close_does_not_wait_for_ever(tmp_path):
     writer.close()
 
 
-def test_a_file_that_is_a_little_behind_makes_nobody_wait():
+def test_a_file_that_is_a_little_behind_causes_no_wait():
     backlog = Backlog(10, block=True)
-    backlog.ended = True                               # so that waiting would return
+    backlog.ended = True                               # so that a wait would return
     backlog.keep_up(0.5 * (WAKE_S + LAG_S))
     assert (backlog.wake.is_set(), backlog.hurry) == (True, False)
     backlog.keep_up(LAG_S)
     assert backlog.hurry
 
 
-def test_a_chunk_ends_by_log_time_and_what_is_in_the_file_is_known(tmp_path):
-    """Stepped time: a second of it takes milliseconds, in which the wall clock closes no chunk."""
+def test_a_chunk_ends_by_log_time_and_its_content_is_known(tmp_path):
+    """A second of stepped time takes milliseconds, so the wall clock closes no chunk."""
     path = tmp_path / "run.mcap"
     writer = RunWriter(path, epoch_ns=0, block=True)
     rng = random.Random(1)
@@ -208,7 +208,7 @@ def test_a_chunk_ends_by_log_time_and_what_is_in_the_file_is_known(tmp_path):
 
 
 def test_a_quiet_run_reaches_the_disk_too(tmp_path):
-    """Nothing but one frame: no sample closes its chunk, so the wall clock does."""
+    """One frame has no sample to close its chunk, so the wall clock closes it."""
     path = tmp_path / "run.mcap"
     writer = RunWriter(path, epoch_ns=0, block=False)
     before = path.stat().st_size
@@ -221,7 +221,7 @@ def test_a_quiet_run_reaches_the_disk_too(tmp_path):
 
 
 def test_how_a_log_that_fails_ends_the_run(tmp_path):
-    """Refused before anything moves, or a partial result; never an internal error."""
+    """The run is refused before motion or gives a partial result, without an internal error."""
     with pytest.raises(LogError) as refused:
         RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, min_free_bytes=10**18)
     with pytest.raises(LogError) as nowhere:
@@ -241,7 +241,7 @@ def test_how_a_log_that_fails_ends_the_run(tmp_path):
 
 
 class Unsynced(Disk):
-    """A disk that takes every byte, but only says when asked for it that it could not keep them."""
+    """Disk that accepts every byte, and reports only at a sync that it could not store them."""
 
     def __init__(self, path, number):
         super().__init__(path)
@@ -251,7 +251,7 @@ class Unsynced(Disk):
         raise OSError(self.number, "what the disk says")
 
 
-def test_a_disk_that_cannot_keep_what_it_took_ends_the_log(tmp_path):
+def test_a_disk_that_cannot_store_accepted_data_ends_the_log(tmp_path):
     disk = Unsynced(tmp_path / "run.mcap", errno.EIO)
     with pytest.raises(LogBroken, match="what the disk says"), RunWriter(
             tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk) as writer:
@@ -260,14 +260,14 @@ def test_a_disk_that_cannot_keep_what_it_took_ends_the_log(tmp_path):
     assert len(read_run(tmp_path / "run.mcap").recording.time_s) > 0
 
 
-def test_what_is_no_disk_needs_no_sync(tmp_path):
+def test_a_file_that_is_no_disk_needs_no_sync(tmp_path):
     disk = Unsynced(tmp_path / "run.mcap", errno.EINVAL)
     with RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk) as writer:
         fill(writer, RecordingBuilder(), 50)
     assert read_run(tmp_path / "run.mcap").complete
 
 
-def test_a_slow_sync_holds_up_nobody_but_the_end(tmp_path, monkeypatch):
+def test_a_slow_sync_delays_only_the_end(tmp_path, monkeypatch):
     asked, gate = threading.Event(), threading.Event()
 
     def slow(number):
@@ -284,7 +284,7 @@ def test_a_slow_sync_holds_up_nobody_but_the_end(tmp_path, monkeypatch):
         writer.close(timeout_s=0.05)
     gate.set()
     writer.close()
-    assert written >= 2000 - 102               # all but the last 0.4 s were in the file meanwhile
+    assert written >= 2000 - 102               # all data except for the last 0.4 s are already in the file
     assert read_run(path).complete
 
 
@@ -309,8 +309,8 @@ def test_a_stage_that_lost_records_is_marked_so_in_the_log(tmp_path):
 
 
 @pytest.mark.parametrize("left", [0, 5, 1000])
-def test_a_cut_just_before_a_write_is_told_at_the_next(tmp_path, left):
-    class Cutting(io.FileIO):          # between the container's look at the file and its write
+def test_a_truncation_just_before_a_write_is_reported_at_the_next(tmp_path, left):
+    class Cutting(io.FileIO):          # between the container's check of the file and its write
         armed = False
 
         def write(self, data):
@@ -333,7 +333,7 @@ def test_a_cut_just_before_a_write_is_told_at_the_next(tmp_path, left):
         one_chunk()
 
 
-def test_a_file_that_was_cut_before_the_look_is_told_with_its_size(tmp_path):
+def test_a_file_truncated_before_the_check_is_reported_with_its_size(tmp_path):
     path = tmp_path / "log.mcap"
     container = Container(io.FileIO(path, "x+"))
 
@@ -348,7 +348,7 @@ def test_a_file_that_was_cut_before_the_look_is_told_with_its_size(tmp_path):
         one_chunk()
 
 
-# -- a log that somebody takes away --------------------------------------------------------------------------------
+# -- a log that is removed -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("block", [True, False])
@@ -381,7 +381,7 @@ def test_a_log_that_was_taken_away_is_told_at_once(tmp_path, block, how, said):
             time.sleep(1e-4)
     assert exit_code(caught.value) is ExitCode.PARTIAL
     assert "Leave the log alone" in caught.value.next_step and str(path) == caught.value.where
-    # Once; the stop goes on without a log, and the end says it again.
+    # Once; the stop continues without a log, and the end reports it again.
     for cycle in range(1000):
         writer.sample(sample(cycle, rng))
     with pytest.raises(LogBroken, match=said):
@@ -389,7 +389,7 @@ def test_a_log_that_was_taken_away_is_told_at_once(tmp_path, block, how, said):
 
 
 def test_a_log_that_was_moved_is_whole(tmp_path):
-    """The same file under another name."""
+    """The file has only another name."""
     path, other = tmp_path / "run.mcap", tmp_path / "elsewhere.mcap"
     writer = RunWriter(path, epoch_ns=0, block=True)
     rng = random.Random(1)
@@ -404,7 +404,7 @@ def test_a_log_that_was_moved_is_whole(tmp_path):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize(("block", "where"), [(True, "at work"), (False, "at work"), (False, "between")])
 def test_a_log_whose_thread_died_is_told_within_a_second(tmp_path, monkeypatch, block, where):
-    """Nothing waits for it for ever, and nothing goes on as if it were written."""
+    """Calls do not wait for it without a limit, and do not continue as if it were written."""
     writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=block)
 
     def die(*_arguments):
@@ -416,7 +416,7 @@ def test_a_log_whose_thread_died_is_told_within_a_second(tmp_path, monkeypatch, 
         monkeypatch.setattr(writer._pump, "_guarded", die)
         writer._backlog.ended = True
         writer._thread.join(HANGS_S)
-        writer._backlog.ended = False              # as if it had been killed where it could not even say so
+        writer._backlog.ended = False              # as if it had been killed without a report
         writer._backlog._alert = 256
     rng = random.Random(1)
     with pytest.raises(LogBroken, match="killed" if where == "at work" else "thread has ended"):
@@ -424,7 +424,7 @@ def test_a_log_whose_thread_died_is_told_within_a_second(tmp_path, monkeypatch, 
             writer.sample(sample(cycle, rng))
             if where == "at work":
                 time.sleep(1e-4)
-    # Between two looks at a thread lies a second of control time; a dead one that could say so takes the first sample.
+    # The thread is checked once per second of control time. A dead one that reported it accepts the first sample.
     assert cycle * 0.004 <= 1.1 if where == "between" else cycle < 50_000
     with pytest.raises(LogBroken):
         writer.close()

@@ -3,7 +3,7 @@ import pytest
 
 @pytest.fixture
 def world():
-    """Makes a fake drive with a guard, a log, a stop request and a bench over it."""
+    """Return a factory of fake drives, each with a guard, a log, a stop request and a bench."""
     from tests.runner.fake_drive import World
 
     return World

@@ -1,4 +1,4 @@
-"""A drive in a few lines: a first-order shaft, a state machine that moves a cycle later, and scripted misbehaviour."""
+"""Minimal drive: a first-order shaft, a state machine with a delay of one cycle, and scripted misbehaviour."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Misbehaviour = Callable[["FakeDrive", Sample], Sample]
 
 @dataclass
 class FakeDrive:
-    """J ω' = T − T_c sgn ω − B ω. In speed mode ω follows its setpoint at once, but for ``follow_s``.
+    """Drive with J ω' = T − T_c sgn ω − B ω. In speed mode ω follows its setpoint at once, or after ``follow_s``.
 
-    ``misbehave`` may replace every sample or raise; ``calls`` is what was asked of the drive, ``disabled_at`` the true
-    speeds at which torque was ever switched off.
+    ``misbehave`` may replace every sample or raise; ``calls`` lists the requests to the drive, ``disabled_at`` the true
+    speeds at which it was disabled.
     """
 
     inertia: float = 100.0
@@ -124,7 +124,7 @@ class FakeDrive:
         )
 
     def fault(self) -> None:
-        """The drive faults; it brakes by itself."""
+        """Put the drive into fault; it brakes without the host."""
         self.state = PowerState.FAULT
 
     def _move(self, command: Command) -> None:
@@ -158,7 +158,7 @@ class FakeDrive:
 
 @dataclass
 class FakeLog:
-    """Keeps everything; ``on_cycle`` may raise."""
+    """Log in memory; ``on_cycle`` may raise."""
 
     on_cycle: Callable[[], None] | None = None
     on_stage: Callable[[str], None] | None = None
@@ -199,7 +199,7 @@ class FakeLog:
 
 @dataclass
 class FakeDisplay:
-    """Knows which stage runs, and for how many cycles it has; ``on_cycle`` is called with both and may raise."""
+    """Display that counts the cycles of the current stage. It calls ``on_cycle`` with both, which may raise."""
 
     on_cycle: Callable[[str, int], None] | None = None
     on_started: Callable[[str], None] | None = None
@@ -235,7 +235,7 @@ class FakeDisplay:
 
 
 class World:
-    """Everything that a bench or a runner needs, around one fake drive."""
+    """One fake drive with everything that a bench or a runner needs."""
 
     def __init__(self, drive: FakeDrive | None = None, limits: MachineLimits = LIMITS, watch=None) -> None:
         self.drive = drive or FakeDrive()
@@ -252,7 +252,7 @@ class World:
         )
 
     def turn(self, speed: float = 5.0, mode: Mode = Mode.SPEED) -> None:
-        """Enabled and turning."""
+        """Enable the drive and turn the shaft."""
         torque = self.drive.coulomb + self.drive.viscous * speed
         self.bench.enable(mode, Command(mode, 0.0, 0.0))
         self.drive.speed = speed
@@ -265,7 +265,7 @@ class World:
 
 
 def lost(drive: FakeDrive, sample: Sample) -> Sample:
-    """A misbehaviour: the bus is gone."""
+    """Misbehaviour: raise that the bus is lost."""
     raise CommunicationLost("the bus is gone")
 
 

@@ -1,4 +1,4 @@
-"""A guard with the usual limits, and what it is shown."""
+"""Guard with the usual limits, and the samples for it."""
 
 from dataclasses import replace
 

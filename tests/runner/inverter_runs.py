@@ -24,9 +24,9 @@ LIMITS = replace(rigs.LIMITS, time_s=3600.0)
 
 
 class InverterDrive(OverInverter):
-    """The simulated inverter as a drive, without a bus, one exchange a cycle.
+    """Simulated inverter as a drive without a bus, with one exchange per cycle.
 
-    The command acts, the plant moves on by a cycle, the reports are read.
+    Each exchange applies the command, advances the plant by one cycle and reads the reports.
     """
 
     def __init__(self, params: RigParams, seed: int, rate_hz: float = 100.0) -> None:
@@ -73,7 +73,7 @@ class Result:
     acquire_s: float
     extensions: int
     note: str
-    looked: float = float("nan")     # what the last look said
+    looked: float = float("nan")     # decision of the last interim look
 
     @property
     def half(self) -> float:
@@ -85,7 +85,7 @@ class Result:
 
 
 def run(seed: int, tolerance: float | None, fixed_s: float | None = None, params: RigParams | None = None) -> Result:
-    """One run, identified."""
+    """Run once and identify the recording."""
     log = BuilderLog()
     request = ExcitationRequest(tolerance=tolerance if fixed_s is None else None, max_time_s=fixed_s)
     task = Task(LIMITS, request, {"gear_ratio": 1.0, "torque_scale_rel_sd": 0.02})

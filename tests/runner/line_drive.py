@@ -1,8 +1,8 @@
-"""A drive on a slow line: the simulated inverter, reached by transactions that take time and do not take it evenly.
+"""Drive on a slow line: the simulated inverter, reached by transactions whose duration varies.
 
-A transaction begins about once a period, lasts a while, and somewhere in it the drive takes the setpoint and latches
-what it reports: both signals at one instant, or (``apart``) each in a read of its own. All that the host knows is the
-middle of the transaction, give or take half of it.
+A transaction begins about once a period. At some time within it, the drive takes the setpoint and latches
+its reports: both signals at one instant, or (``apart``) each in a separate read. The host knows only the
+middle of the transaction, with half its duration as uncertainty.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from tests.rigs import DRIVE_LIMITS, LIMITS
 from tests.runner.fake_drive import FakeDisplay
 
 COARSE = RigParams(drive=DriveParams(control_period_s=0.005))
-"""The default rig in steps of 5 ms: a run takes less than half the time."""
+"""Default rig in steps of 5 ms, with which a run takes less than half the time."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """``period_s`` from one transaction to the next, ``share`` of it that one takes, ``jitter`` of either as a share.
+    """Timing: ``period_s`` between transactions, ``share`` of it that one takes, ``jitter`` of both as a share.
 
     ``apart``: speed and torque are read one after the other.
     """
@@ -43,7 +43,7 @@ class Line:
 
 
 class OverInverter:
-    """What the drives over `sim_bus.inverter` have in common of the Drive contract."""
+    """Common part of the Drive contract of the drives over `sim_bus.inverter`."""
 
     params: RigParams
     modes: frozenset[Mode] = frozenset(Mode)
@@ -72,7 +72,7 @@ class OverInverter:
         )
 
     def reset_fault(self) -> None:
-        """It never is in fault."""
+        """Do nothing: it is never in fault."""
 
     def enable(self, mode: Mode) -> None:
         self._wish = PowerState.ENABLED
@@ -86,7 +86,7 @@ class OverInverter:
 
 @dataclass
 class LineDrive(OverInverter):
-    """A drive on a slow line."""
+    """Drive on a slow line."""
 
     line: Line
     params: RigParams = COARSE
@@ -112,8 +112,8 @@ class LineDrive(OverInverter):
 
     @property
     def period_s(self) -> float:
-        """Known once preflight has measured it, as on a real line."""
-        assert self.ready, "the period was read before preflight had measured it"
+        """Period, available once preflight has measured it, as on a real line."""
+        assert self.ready, "the period was read before preflight measured it"
         return self.line.period_s
 
     def preflight(self, limits: DriveLimits) -> Preflight:
@@ -181,7 +181,7 @@ class LineDrive(OverInverter):
 
 
 class BuilderLog:
-    """What RunLog does, without a file."""
+    """RunLog without a file."""
 
     def __init__(self) -> None:
         self.builder = RecordingBuilder()
@@ -223,7 +223,7 @@ class BuilderLog:
 
 @dataclass(frozen=True)
 class LineRun:
-    """A whole run: how it ended, what it left, and what it said."""
+    """A whole run: its outcome, its recording, and its messages."""
 
     outcome: RunOutcome
     recording: Recording
@@ -235,7 +235,7 @@ class LineRun:
 def run_line(
     drive: LineDrive, request: ExcitationRequest | None = None, limits: MachineLimits = LIMITS
 ) -> LineRun:
-    """All five stages over the line."""
+    """Run all five stages over the line."""
     log, display = BuilderLog(), FakeDisplay()
     task = Task(limits, request or ExcitationRequest(), {"torque_scale_rel_sd": 0.02})
     outcome = Runner(drive, lambda _: task, log, StopRequest(), display, lambda *_: None).run()

@@ -1,4 +1,4 @@
-"""A fake drive whose reports lie."""
+"""Fake drive with false reports."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from tests.runner.fake_drive import FakeDrive
 
 @dataclass
 class Reporting(FakeDrive):
-    """Reports its position, answers polls and can be told to remove its torque; each of the reports may lie.
+    """Drive that reports its position, answers polls and removes its torque on request. Each report may be false.
 
     ``sees``: the speed that the drive reports instead of its own. ``pushes_nm``: the torque that acts in its quick
     stop. ``polled``: the speed that a single request shows.

@@ -1,8 +1,8 @@
-"""A rigid shaft, a drive and what the drive reports of both, for tests of the observer alone.
+"""Rigid shaft, drive, and the reports of the drive, for tests of the observer alone.
 
 The shaft has Coulomb and viscous friction. The drive follows a speed setpoint by a PI controller, or puts the commanded
-torque on the shaft. Each report has a first-order lag, noise and a count of its own. A lie changes the reports; a wrong
-sensor changes what the drive's speed control sees, too.
+torque on the shaft. Each report has its own first-order lag, noise and resolution. A lie changes the reports; a wrong
+sensor also changes the speed that the drive's speed control uses.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STEP_S = 0.002
 
 
 class Reports(NamedTuple):
-    """What a drive says of its shaft."""
+    """Reports of a drive about its shaft."""
 
     speed_rad_s: float
     torque_nm: float
@@ -36,7 +36,7 @@ Lie = Callable[[Reports], Reports]
 
 @dataclass(frozen=True)
 class Rig:
-    """Shaft, limits and reports."""
+    """Shaft, limits and reports of a rig."""
 
     inertia: float = 100.0
     viscous: float = 8.0
@@ -60,21 +60,21 @@ class Rig:
 
     @property
     def acceleration(self) -> float:
-        """What half of the torque that friction leaves can do, rad/s²."""
+        """Acceleration with half of the torque that exceeds friction, rad/s²."""
         return 0.5 * (self.limits.torque_nm - self.friction(self.limits.speed_max_rad_s)) / self.inertia
 
 
 @dataclass
 class Bench:
-    """One run over a rig: true shaft, drive, reports, and the observer that sees them."""
+    """One run on a rig: true shaft, drive, reports, and the observer of the reports."""
 
     rig: Rig
     seed: int = 1
     lie: Lie | None = None
     sensor: Callable[[float], float] | None = None
-    polarity: float = 1.0              # of the true torque, beside what the drive reports
-    stuck_nm: float | None = None      # torque that stays, whatever control wants; it is reported
-    inverted_stop: bool = False        # a quick stop accelerates; the torque is reported as it is
+    polarity: float = 1.0              # of the true torque; the drive reports another one
+    stuck_nm: float | None = None      # torque that stays, independent of the control; it is reported
+    inverted_stop: bool = False        # a quick stop accelerates; the torque report is true
 
     time_s: float = 0.0
     speed: float = 0.0
@@ -169,7 +169,7 @@ class Bench:
         self.speed = 0.0 if speed * sign < 0.0 and abs(torque) <= rig.coulomb else speed
         self.angle += self.speed * dt
 
-    # -- what tdhil does with it -----------------------------------------------------------------------------------
+    # -- the phases of a run ---------------------------------------------------------------------------------------
 
     def hold(self, seconds: float, speed: float) -> None:
         """Speed mode at a constant setpoint."""
@@ -185,7 +185,7 @@ class Bench:
             self.cycle(Command(Mode.SPEED, start + (speed - start) * step / cycles, 0.0))
 
     def probe(self) -> None:
-        """Torque rises until the shaft moves, as the sign probe has it."""
+        """Raise the torque until the shaft moves, as the sign probe does."""
         most = self.rig.limits.torque_nm
         for step in range(round(6.0 / self.rig.period_s)):
             sample = self.cycle(Command(Mode.TORQUE, 0.0, most * step * self.rig.period_s / 6.0))
@@ -193,7 +193,7 @@ class Bench:
                 return
 
     def first_levels(self) -> None:
-        """Standstill, sign probe and two steady levels: what happens before J is known."""
+        """Run standstill, sign probe and two operating points: the phases before J is known."""
         for _ in range(round(0.5 / self.rig.period_s)):
             self.cycle(Command(Mode.TORQUE, 0.0, 0.0))
         self.probe()
@@ -204,14 +204,14 @@ class Bench:
         self.hold(3.0, 0.4 * top)
 
     def know(self, wrong: float = 0.05, rel_error: float = 0.15) -> None:
-        """What stage 2 gives: J that is ``wrong`` by a share of it."""
+        """Give the observer the result of stage 2: J with a relative error of ``wrong``."""
         rig = self.rig
         self.observer.know(RigGuess(rig.inertia * (1.0 + wrong), rig.viscous, rig.coulomb, rel_error))
         if rig.position_count:
             self.observer.compare_position(1.0)
 
     def begun(self, speed: float = 5.0) -> Bench:
-        """Everything up to stage 2's end, and on to a speed."""
+        """Run everything up to the end of stage 2, then go to a speed."""
         self.first_levels()
         self.know()
         self.ramp(speed)
@@ -219,7 +219,7 @@ class Bench:
         return self
 
     def excite(self, seconds: float, speed: float, swing: float, frequency_hz: float = 0.25) -> None:
-        """Torque mode: a sine about a mean speed, which weak feedback holds."""
+        """Excite in torque mode: a sine about a mean speed that weak feedback holds."""
         rig = self.rig
         start_s, omega = self.time_s, 2.0 * math.pi * frequency_hz
         for _ in range(round(seconds / rig.period_s)):
@@ -230,7 +230,7 @@ class Bench:
             self.cycle(Command(Mode.TORQUE, 0.0, torque))
 
     def quick_stop(self, seconds: float) -> str:
-        """The drive brakes; how it runs away, once that is found."""
+        """Brake the drive; return how it runs away, once the observer finds it."""
         self.state = PowerState.QUICK_STOP
         self.observer.begin_stop()
         for _ in range(round(seconds / self.rig.period_s)):
@@ -240,7 +240,7 @@ class Bench:
         return ""
 
     def found_after(self, seconds: float, act: Callable[[], None]) -> float | None:
-        """Time from now until there is a doubt, while ``act`` is done again and again; None within ``seconds``."""
+        """Repeat ``act``; return the time until the observer doubts a report, s. None: no doubt within ``seconds``."""
         start_s = self.time_s
         while self.time_s - start_s < seconds:
             act()

@@ -1,4 +1,4 @@
-"""How a run of the fake drive went: its stages by name and outcome, and its shaft at rest."""
+"""Outcome of a run of the fake drive: stages by name and outcome, and the shaft at standstill."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What a stop asks of the fake drive, and the times that it keeps to there."""
+"""Requests of a stop to the fake drive, and the times of that stop."""
 
 from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stop import SILENT_CYCLES, SILENT_S
@@ -9,5 +9,5 @@ LAG_S = ControlAssumptions().largest_speed_lag_s
 
 
 def asked(drive):
-    """What was asked of the drive, without the exchanges."""
+    """Return the requests to the drive, without the exchanges."""
     return [call for call in drive.calls if call != "exchange" and not call.startswith("enable")]

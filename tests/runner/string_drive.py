@@ -1,4 +1,4 @@
-"""A fake drive with a drill string on its shaft, stuck at the bottom and twisted: it turns back as soon as it may."""
+"""Fake drive with a drill string that is stuck at the bottom and twisted. It turns back once torque is released."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RESIDUAL_NM = 8.0                     # 2 % of 400 N·m; five quanta of 1 N·m a
 
 @dataclass
 class StringDrive(FakeDrive):
-    """``twist_nm``: what the string holds at the beginning. ``swing_nm``: what it swings by, dying out in 10 s."""
+    """Drive and string. ``twist_nm``: trapped torque at first. ``swing_nm``: amplitude that decays within 10 s."""
 
     stiffness: float = 100.0
     twist_nm: float = 0.0
@@ -24,7 +24,7 @@ class StringDrive(FakeDrive):
     coulomb: float = 5.0
     angle: float = 0.0
     lowest_speed: float = 0.0
-    work_j: float = 0.0               # done on the string by the motor
+    work_j: float = 0.0               # work of the motor on the string
 
     def __post_init__(self) -> None:
         self.angle = self.twist_nm / self.stiffness
@@ -54,7 +54,7 @@ class StringDrive(FakeDrive):
 
 
 class StringWorld(World):
-    """A bench over a string, enabled in speed mode at standstill or turning."""
+    """Bench above a string, enabled in speed mode, at standstill or in motion."""
 
     def __init__(self, limits=STRING, speed: float = 0.0, mode: Mode = Mode.SPEED, **drive) -> None:
         super().__init__(StringDrive(**drive), limits)

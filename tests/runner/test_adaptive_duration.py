@@ -1,4 +1,4 @@
-"""Stage 5 that goes on until it is enough: what is run, what is announced, what is decided, and how it ends early."""
+"""Adaptive duration of stage 5: the segments, their announcement, the decisions, and an early end."""
 
 import math
 import signal
@@ -27,7 +27,7 @@ RULE = Stopping(0.01, 0.95, 20.0, 6, 10, 600.0, True)
 
 
 class Stub:
-    """Says in advance how many periods more are wanted."""
+    """Decisions with a given number of further periods."""
 
     at_last = False
 
@@ -39,7 +39,7 @@ class Stub:
         return lambda: Decision(self.wanted.pop(0), "because", None, 0, 0.95, at_last=self.at_last)
 
     def decided(self, decision):
-        """Not kept."""
+        """Discard the decision."""
 
 
 def acquire(world, stub):
@@ -56,7 +56,7 @@ def acquire(world, stub):
 
 
 @pytest.mark.heavy
-def test_the_last_mean_speed_goes_on_and_the_others_are_gone_back_to(world):
+def test_an_extension_continues_at_the_last_mean_speed_and_returns_to_the_others(world):
     stub = Stub(4, 2, 0)
     _, _, run = acquire(world, stub)
     excitation = run()
@@ -67,12 +67,12 @@ def test_the_last_mean_speed_goes_on_and_the_others_are_gone_back_to(world):
     for before, behind in zip(excitation.segments, excitation.segments[1:], strict=False):
         assert before.end_s <= behind.start_s
     assert stub.asked_s == sorted(stub.asked_s)
-    # the time that an extension is reckoned to take is the time that it takes
+    # an extension takes the time that was planned for it
     assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(PLAN.extension_s(4), abs=3.0)
 
 
 @pytest.mark.heavy
-def test_what_is_little_is_run_where_the_shaft_is(world):
+def test_a_short_extension_is_run_at_the_last_mean_speed_only(world):
     stub = Stub(4, 0)
     stub.at_last = True
     _, _, run = acquire(world, stub)
@@ -81,7 +81,7 @@ def test_what_is_little_is_run_where_the_shaft_is(world):
     assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(4.0 * PLAN.segments[0].reference.period_s, abs=0.1)
 
 
-def test_a_pilot_that_is_enough_is_the_whole_run(world):
+def test_a_sufficient_pilot_is_the_whole_run(world):
     _, _, run = acquire(world, Stub(0))
     assert [round((one.end_s - one.start_s) / one.period_s) for one in run().segments] == [3, 3]
 
@@ -101,7 +101,7 @@ def test_a_stop_during_an_extension_leaves_a_log_that_can_be_read(world):
     assert round((second.end_s - second.start_s) / second.period_s) == 7      # as planned when it was announced
 
 
-def test_in_real_time_the_motion_goes_on_while_it_is_looked(world):
+def test_in_real_time_the_motion_continues_during_an_interim_look(world):
     here, _, run = acquire(world, Stub(0))
     here.drive.clock.stepped = False
     commands = len(here.drive.commands)
@@ -127,11 +127,11 @@ def recording(counted=6):
 @pytest.mark.parametrize(
     ("interval", "now", "scale", "then", "looks", "seen", "left_s", "periods", "after"),
     [
-        (0.008, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 0, 0),      # both say that it is enough
-        (0.030, 0.0200, 2.0, 0.0095, 0, 0, 400.0, 6, 0),      # the scatter says how much
-        (0.008, 0.0120, 1.2, 0.0095, 0, 0, 400.0, 2, 0),      # never by a narrow interval alone, nor too little
-        (0.0101, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 6, 1),     # too wide all the same: once more here, another look
-        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 18, 1),     # … by how much it is too wide, at most three times all
+        (0.008, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 0, 0),      # scatter and interval are both sufficient
+        (0.030, 0.0200, 2.0, 0.0095, 0, 0, 400.0, 6, 0),      # the scatter determines the number of periods
+        (0.008, 0.0120, 1.2, 0.0095, 0, 0, 400.0, 2, 0),      # a narrow interval alone is no end; a minimum applies
+        (0.0101, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 6, 1),     # the interval is too wide: more periods, another look
+        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 18, 1),     # … in proportion to the excess, at most three times all
         (0.030, 0.0080, 1.0, 0.0080, 0, 0, 70.0, 7, 1),
         (0.008, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 0, 1),
         (0.030, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 18, 2),
@@ -156,14 +156,14 @@ def test_decisions(monkeypatch, interval, now, scale, then, looks, seen, left_s,
     (0.008, 0, 400.0, 0, 0),
     (0.0105, 0, 900.0, 5, 1),             # six periods at ±1.05 %: (1.05·1.05·1.17)² − 1 = 0.68 times as many more
     (0.0099999, 0, 900.0, 0, 0),
-    (0.010001, 0, 900.0, 4, 1),           # the next interval that is looked at has a wider quantile
-    (0.100, 0, 900.0, 18, 1),             # three times all before at most: the next one's confidence rests on it
-    (0.100, 0, 100.0, 4, 1),              # what there is time for
+    (0.010001, 0, 900.0, 4, 1),           # the next interim look has a wider quantile
+    (0.100, 0, 900.0, 18, 1),             # at most three times all before: the next confidence assumes it
+    (0.100, 0, 100.0, 4, 1),              # limited by the time left
     (0.011, 4, 900.0, 0, 0),
     (0.011, 0, 50.0, 0, 0),               # no time for two
     (np.inf, 0, 900.0, 0, 0),
 ])
-def test_what_the_scatter_can_t_judge_is_judged_by_its_interval(monkeypatch, interval, looks, left_s, periods, after):
+def test_without_an_estimate_of_the_scatter_the_interval_decides(monkeypatch, interval, looks, left_s, periods, after):
     monkeypatch.setattr(enough_room, "look", lambda *_: None)
     monkeypatch.setattr(enough_room, "interval_of", lambda *_: interval)
     found = decide(recording(), RULE, PLAN, left_s, looks, 0)
@@ -173,14 +173,14 @@ def test_what_the_scatter_can_t_judge_is_judged_by_its_interval(monkeypatch, int
     assert found.plain()["interval"] == (interval if np.isfinite(interval) else None)
 
 
-def test_of_a_string_a_rigid_shaft_s_scatter_is_not_asked(monkeypatch):
+def test_with_a_string_the_scatter_of_a_rigid_shaft_is_not_used(monkeypatch):
     monkeypatch.setattr(enough_room, "look", lambda *_: pytest.fail("looked at"))
     monkeypatch.setattr(enough_room, "interval_of", lambda *_: 0.009)
     found = decide(recording(), replace(RULE, by_interval=True), PLAN, 900.0, 0, 0)
     assert (found.periods, found.interval) == (0, 0.009)
 
 
-def test_what_the_scatter_says_is_missing_is_run_where_the_shaft_is(monkeypatch):
+def test_a_few_missing_periods_are_run_at_the_last_mean_speed(monkeypatch):
     monkeypatch.setattr(enough_room, "look", lambda *_: Look(12.0, 0.012, 1.3, 0.0095, True, at_last=True))
     found = decide(recording(), RULE, PLAN, 400.0, 0, 0)
     assert (found.periods, found.at_last, found.seen) == (4, True, 0)
@@ -188,8 +188,8 @@ def test_what_the_scatter_says_is_missing_is_run_where_the_shaft_is(monkeypatch)
 
 
 @pytest.mark.heavy
-def test_all_looks_together_miss_no_more_than_asked():
-    """Signed roots of data that grow as fast as they may behind a look: an interval whose root is too large misses."""
+def test_all_interim_looks_together_keep_the_requested_coverage():
+    """Signed roots of data that grow as fast as allowed after a look. An interval misses if its root is too large."""
     rng = np.random.default_rng(3)
     root, missed = rng.standard_normal(400_000), np.zeros(400_000, dtype=bool)
     for seen in range(5):

@@ -1,4 +1,4 @@
-"""The angle against the reported speed, on a shaft whose true way is known in closed form."""
+"""Comparison of angle and reported speed, on a shaft with a true angle in closed form."""
 
 import math
 
@@ -20,7 +20,7 @@ def sample(time_s, speed_rad_s, fresh=True):
 
 
 def watched(factor, counts_per_turn, wraps_rad, seconds=6.0, speed_rad_s=1.0, swing=0.3, lost=0.0):
-    """``factor``: how many times faster the true shaft turns than it is reported to; unsteadily, by ``swing``."""
+    """Watch a shaft. ``factor``: true over reported speed. ``swing``: relative amplitude of its variation."""
     angles, count = Angles(), 2.0 * math.pi / counts_per_turn
     for k in range(round(seconds / PERIOD_S)):
         time_s = k * PERIOD_S
@@ -47,23 +47,23 @@ def test_the_factor_is_found(factor, backwards, counts, wraps_rad, swing, lost):
 
 @pytest.mark.heavy
 @given(st.floats(0.2, 10.0))
-def test_a_counter_of_turns_takes_turns_and_is_then_right(factor):
+def test_a_counter_of_turns_needs_some_turns_and_is_then_right(factor):
     seconds = 3.2 * 2.0 * math.pi / factor
     ratio = watched(factor, 1, None, seconds=seconds + 2.0, swing=0.0).ratio()
     assert ratio is None or ratio.value == pytest.approx(factor, rel=0.07)
     assert watched(factor, 1, None, seconds=40.0 / factor + 4.0, swing=0.0).ratio() is not None
 
 
-def test_it_isnt_told_too_early():
+def test_the_factor_is_not_reported_too_early():
     assert watched(1.0, 4096, None, seconds=1.5).ratio() is None
 
 
-def test_standing_still_is_told_after_more_than_a_turn():
+def test_a_constant_angle_is_reported_after_more_than_one_turn():
     assert watched(0.0, 4096, None, seconds=6.0).ratio() is None          # it could be a counter of turns
     assert watched(0.0, 4096, None, seconds=9.0).ratio().value == 0.0
 
 
-def test_one_that_starts_over_too_often_tells_nothing():
+def test_an_angle_that_restarts_too_often_gives_no_factor():
     angles = watched(1.0, 4096, 2.0 * math.pi, speed_rad_s=20.0)
     assert angles.blind
     assert angles.ratio() is None
@@ -75,4 +75,4 @@ def test_one_that_starts_over_too_often_tells_nothing():
 def test_the_speed_of_the_angle_is_between_its_bounds(factor):
     low, high = watched(factor, 4096, None, swing=0.0).speed_rad_s()
     assert low <= factor <= high
-    assert high - low < 0.45 * factor          # at a steady speed nothing tells a count from a step
+    assert high - low < 0.45 * factor          # at a steady speed a count looks like a step

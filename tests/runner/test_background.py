@@ -1,6 +1,6 @@
-"""Arithmetic in a process of its own: what it gives and raises, how it goes wrong, and that nothing is left of it.
+"""Computation in the worker process: results, exceptions, failures, and no process left afterwards.
 
-The waits only bound what would hang. Functions that are asked for stand in modules that the process can load, too.
+The waits are time-outs only. The functions are in modules that the worker process can also load.
 """
 
 import functools
@@ -28,9 +28,9 @@ REST = Command(Mode.SPEED, 0.0, 0.0)
 LIGHT = background._PROGRAM.replace(
     "from tdhil", "import tdhil.runner.preconditions as rate; rate.load_before_motion = lambda: None\nfrom tdhil"
 )
-"""Loads no more than it must: these tests are not about cycles that are late."""
+"""Worker program without the usual preloading: these tests do not examine late cycles."""
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="looks at processes by POSIX signals")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="checks processes by POSIX signals")
 
 
 def never():
@@ -46,7 +46,7 @@ def texts(here):
 
 
 def gone(pid):
-    """Is there no such process any more, not even a dead one that nobody has asked about?"""
+    """Return whether the process no longer exists, not even as a zombie."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -63,7 +63,7 @@ def within(condition):
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
-    """A computer with other things to do may take longer to bury a process."""
+    """Allow more time: a busy computer removes a dead process later."""
     monkeypatch.setattr(background, "_REAPED_S", HANGS_S)
 
 
@@ -78,7 +78,7 @@ def worker_process():
 
 @pytest.fixture
 def live(world, worker_process):
-    """A bench in real time, with a process beside it."""
+    """Bench in real time with a worker process."""
     here = world()
     here.drive.clock.stepped = False
     here.bench.worker_process = worker_process
@@ -86,7 +86,7 @@ def live(world, worker_process):
 
 
 @pytest.mark.heavy
-def test_it_gives_what_the_function_gives_and_raises_what_it_raises(live):
+def test_it_returns_the_result_of_the_function_or_raises_its_exception(live):
     compute = functools.partial(live.bench.compute, command=REST)
     assert compute(functools.partial(math.hypot, 3.0, 4.0)) == 5.0
     assert compute(os.getpid) == live.bench.worker_process.pid
@@ -111,7 +111,7 @@ def test_it_gives_what_the_function_gives_and_raises_what_it_raises(live):
     ]
 )
 def test_the_plan_is_the_one_that_a_thread_makes(world, worker_process, monkeypatch, wish):
-    """To the last bit, all that is logged of it included."""
+    """The plan and its log entries agree to the last bit."""
     asked = []
 
     def compute(bench, work, command):
@@ -135,7 +135,7 @@ def test_its_linear_algebra_keeps_to_one_core_so_that_the_control_loop_has_the_o
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
-def test_where_it_dies_in_the_midst_of_work_a_thread_does_it_and_the_log_says_so(live, tmp_path, end):
+def test_if_the_process_dies_during_work_a_thread_takes_over_and_the_log_states_it(live, tmp_path, end):
     begun = tmp_path / "begun"
     program = f"""
 import os, pathlib, time
@@ -150,14 +150,14 @@ while os.getpid() != {os.getpid()}:
     (event,) = texts(live)
     assert "in a thread" in event
     assert "EOFError" in event
-    assert live.bench.compute(functools.partial(max, 1, 2), REST) == 2        # it stays dead, and that stops nothing
+    assert live.bench.compute(functools.partial(max, 1, 2), REST) == 2        # it is not restarted; the run continues
 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(
     ("work", "kind"), [(lambda: 3, "int"), (functools.partial(compile, "3", "", "eval"), "code")]
 )
-def test_what_can_t_be_handed_over_or_back_is_done_by_a_thread(live, work, kind):
+def test_work_that_cannot_be_pickled_is_done_by_a_thread(live, work, kind):
     assert type(live.bench.compute(work, REST)).__name__ == kind
     (event,) = texts(live)
     assert "in a thread" in event
@@ -177,7 +177,7 @@ def test_a_stop_is_not_held_up_and_the_process_is_killed(live):
         live.bench.compute(functools.partial(time.sleep, HANGS_S), REST)
     assert live.drive.cycles == asked[0]                  # not a cycle later
     assert live.bench.worker_process._process.wait(HANGS_S) == -signal.SIGKILL
-    assert texts(live) == []                                                  # and no thread went on with it
+    assert texts(live) == []                                                  # and no thread continued the work
 
 
 def test_ctrl_c_at_the_terminal_does_not_reach_it(worker_process):
@@ -188,7 +188,7 @@ def test_ctrl_c_at_the_terminal_does_not_reach_it(worker_process):
 
 
 @pytest.mark.heavy
-def test_it_is_nicer_than_the_loop_and_inherits_nothing_but_its_pipes(worker_process, tmp_path):
+def test_it_has_a_lower_priority_than_the_loop_and_inherits_only_its_pipes(worker_process, tmp_path):
     assert worker_process.ask(functools.partial(os.nice, 0)) >= os.nice(0) + background.NICE
     assert worker_process.ask(functools.partial(os.sched_getscheduler, 0)) == os.SCHED_OTHER
     with (tmp_path / "ours").open("w") as ours:
@@ -204,7 +204,7 @@ def test_it_is_nicer_than_the_loop_and_inherits_nothing_but_its_pipes(worker_pro
 
 @pytest.mark.heavy
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler") or os.geteuid() != 0, reason="needs to be allowed SCHED_FIFO")
-def test_a_real_time_priority_is_not_handed_down():
+def test_a_real_time_priority_is_not_inherited():
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     try:
@@ -242,7 +242,7 @@ time.sleep(600)
 
 
 def dead(pid):
-    """Gone, or waiting for a process above us to ask about it."""
+    """Return whether the process is gone or a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
@@ -253,7 +253,7 @@ def dead(pid):
     ("program", "said"),
     [("import os; os._exit(1)", "died"), ("print('no pickle')", "died"), ("import time; time.sleep(600)", "not ready")],
 )
-def test_a_start_that_fails_is_told_and_leaves_nothing(program, said):
+def test_a_failed_start_is_reported_and_leaves_no_process(program, said):
     done = []
     found, why = begin(lambda: done.append(1), never, within_s=0.2 if said == "not ready" else HANGS_S, program=program)
     assert found is None
@@ -276,7 +276,7 @@ def test_a_stop_request_ends_the_wait_for_it():
 @pytest.mark.heavy
 @pytest.mark.parametrize("ready", [True, False])
 def test_a_run_has_one_in_real_time_and_leaves_none_behind(world, monkeypatch, ready):
-    """Made before the drive is armed; killed before the stop begins, whichever way the run ends."""
+    """It starts before the drive is armed. It is killed before the stop begins, for each end of the run."""
     made, calls = [], []
 
     def start(meanwhile, stopped):
@@ -292,7 +292,7 @@ def test_a_run_has_one_in_real_time_and_leaves_none_behind(world, monkeypatch, r
     monkeypatch.setattr(five_stages, "load_before_motion", nothing)
     here = world()
     here.drive.clock.stepped = False
-    # The clock of the fake drive steps all the same; the plan is cut short by a stop.
+    # The clock of the fake drive is stepped here too. A stop interrupts the plan.
     here.drive.misbehave = lambda drive, sample: (
         drive.cycles == 200 and here.stop_request.ask(signal.SIGINT), sample)[1]
     result = here.runner(ExcitationRequest(periods=2)).run()

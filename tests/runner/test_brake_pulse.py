@@ -1,4 +1,4 @@
-"""The braking probe's pulse, tried on shafts of a few lines: rightly read, and read as full torque forward."""
+"""Pulse of the braking probe on simple shafts: read with the right sign, and read as full torque forward."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -25,7 +25,7 @@ def planned(limits=LIMITS, guess=USUAL, speed=2.9, flowing=83.0, noise=0.02, per
 
 
 def turned(torques, speed, inertia, period_s, friction_nm=0.0):
-    """Speeds of a shaft under one torque a cycle, against a friction that never turns it round."""
+    """Return the speeds of a shaft under one torque per cycle and friction. Friction does not reverse the shaft."""
     seen = [speed]
     for torque in torques:
         seen.append(seen[-1] + (torque - friction_nm) / inertia * period_s)
@@ -41,7 +41,7 @@ rigs = st.sampled_from([LIMITS, replace(LIMITS, load="string", torque_ramp_nm_s=
 
 
 @given(shaft=shafts, limits=rigs, period_s=st.sampled_from(PERIODS), lighter=st.floats(0.7, 1.5))
-def test_the_worst_that_a_pulse_can_do_is_known_before(shaft, limits, period_s, lighter):
+def test_the_worst_case_of_a_pulse_is_predicted(shaft, limits, period_s, lighter):
     guess, flowing, speed, noise = shaft
     pulse = planned(limits, guess, speed, flowing, noise, period_s)
     if isinstance(pulse, NoPulse):
@@ -59,12 +59,12 @@ def test_the_worst_that_a_pulse_can_do_is_known_before(shaft, limits, period_s, 
     highest = max(turned(acting, speed, inertia, period_s))
     assert highest <= pulse.highest_rad_s + limits.torque_nm / inertia * period_s
     assert pulse.highest_rad_s <= speed + 0.8 * (limits.speed_max_rad_s - speed) + 1e-9
-    # Rightly read, the shaft stays in its window and slows down by what was announced.
+    # With the right sign, the shaft stays in its window and slows down by the announced amount.
     slowed = turned(setpoints, speed, inertia, period_s, flowing)
     assert min(slowed) >= max(0.0, limits.speed_min_rad_s)
     assert (speed - slowed[-1]) * lighter == pytest.approx(pulse.slowing_rad_s, rel=1e-6)
     assert pulse.slowing_rad_s >= 2.0 * noise
-    # The guard, which looks ahead, lets it through at every speed on the way; noise is reckoned with.
+    # The guard predicts the speed and accepts the pulse at every speed on the way, noise included.
     guard = Guard(limits, period_s, 0.01, 1.0, ControlAssumptions())
     for seen in (speed, min(slowed)) if lighter >= 1.0 else (speed,):
         assert guard.predicted_speed(guess, pulse.torque_nm, seen - noise) >= 0.0
@@ -86,7 +86,7 @@ def test_on_a_usual_rig_it_is_short_and_can_be_seen(period_s):
       "out of its window within 0.2 s", "--mode speed"),
      ({"noise": 1.0}, "too little to detect", "--mode speed")],
 )
-def test_a_shaft_without_a_pulse_is_told_why(change, why, step):
+def test_a_plan_without_a_pulse_states_the_reason(change, why, step):
     found = planned(**change)
     assert isinstance(found, NoPulse)
     assert why in found.why
@@ -108,17 +108,17 @@ def test_with_a_string_the_torque_goes_down_and_up_on_ramps():
 
 
 @given(wander=st.floats(0.0, 4.0), speed=st.floats(1.0, 8.0))
-def test_a_pulse_leaves_a_restless_string_its_room(wander, speed):
-    """What the string may take the shaft by besides, and the pulse, end above the window's lower end together."""
+def test_a_pulse_keeps_a_margin_for_the_oscillation_of_a_string(wander, speed):
+    """The pulse and the oscillation of the string together keep the speed above the lower end of the window."""
     limits = replace(LIMITS, load="string", torque_ramp_nm_s=20.0)
     before = Before(speed, 83.0, 0.02, 0.0, wander)
     pulse = plan_pulse(limits, USUAL, ControlAssumptions(), before, 0.02)
     if isinstance(pulse, Pulse):
         assert speed - pulse.slowing_rad_s - wander >= limits.speed_min_rad_s
-        assert pulse.slowing_rad_s >= 1.25 * wander       # or the string would be taken for an answer
+        assert pulse.slowing_rad_s >= 1.25 * wander       # a smaller pulse could not be distinguished from the string
 
 
-def test_it_is_tried_faster_where_a_string_is_restless():
+def test_the_probe_is_at_a_higher_speed_if_a_string_oscillates():
     low, high = mean_speeds(LIMITS)
     assert slow_speed(LIMITS) == low
     assert slow_speed(LIMITS, 0.5) == low + 0.5

@@ -1,4 +1,4 @@
-"""The braking probe in a run: drives that read torque below zero in ways of their own, and runs that never need any."""
+"""Braking probe in a run: drives that misread a negative torque, and runs that need no negative torque."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ SAID = {"unsigned": "inverts a negative torque setpoint", "magnitude": "torque d
 
 
 class Misreading(FakeDrive):
-    """Takes the torque setpoint as ``read`` does."""
+    """Drive that reads the torque setpoint with ``read``."""
 
     read = staticmethod(float)
     fastest = 0.0
@@ -32,7 +32,7 @@ class Misreading(FakeDrive):
 
 @dataclass
 class MisreadingLine(LineDrive):
-    """The same over a line, with the simulated drive's lags and noise."""
+    """The same drive over a line, with the lags and noise of the simulated drive."""
 
     how: str = "unsigned"
 
@@ -99,7 +99,7 @@ def test_a_shaft_too_light_to_try_is_never_braked_by_torque(world):
 
 
 @pytest.mark.heavy
-def test_where_the_plan_needs_what_could_not_be_tried(world):
+def test_a_plan_that_needs_untested_braking_torque(world):
     here = world(FakeDrive(inertia=5.0, coulomb=3.0, viscous=0.5))
     cause = here.runner(ExcitationRequest(periods=2)).run().cause
     assert isinstance(cause, PreflightRefused)
@@ -113,7 +113,7 @@ def test_where_the_plan_needs_what_could_not_be_tried(world):
 
 
 @pytest.mark.heavy
-def test_in_speed_mode_there_is_nothing_to_try(world):
+def test_in_speed_mode_there_is_no_braking_probe(world):
     here = world()
     assert here.runner(ExcitationRequest(mode="speed", periods=2)).run().cause is None
     assert not any("braking" in text for _, text in here.log.events)

@@ -1,4 +1,4 @@
-"""The rate that a computer holds: tried from above, by the cycles themselves, before anything moves."""
+"""Choice of the cycle rate: tests with real cycles, from the highest rate down, before any motion."""
 
 import signal
 
@@ -14,7 +14,7 @@ RATES = (250.0, 200.0, 125.0, 100.0, 50.0, 25.0)
 
 
 class PacedDrive(FakeDrive):
-    """Begins as late as ``late(rate, cycle)`` says, s; answers no cycle of which ``deaf`` says so."""
+    """Drive whose cycles begin ``late(rate, cycle)`` seconds late. Cycles of ``deaf`` get no answer."""
 
     def __init__(self, late=lambda rate, cycle: 0.0, deaf=lambda rate, cycle: False, rates=RATES):
         super().__init__()
@@ -54,7 +54,7 @@ def test_a_quiet_computer_holds_the_profiles_rate():
 @pytest.mark.parametrize(("late_s", "rate"), [(0.0019, 250), (0.0021, 200), (0.003, 125), (0.0045, 100), (0.0099, 50),
                                               (0.019, 25), (1.0, 25)])
 def test_the_highest_rate_whose_half_period_is_longer_than_the_delay(late_s, rate):
-    """Every hundredth cycle is late by so much: p99 and more of them."""
+    """Every hundredth cycle is late by this delay, so that the 99th percentile contains it."""
     drive = PacedDrive(lambda rate, cycle: late_s if cycle % 97 == 96 else 0.0)
     choice = chosen(drive)
     assert choice.taken.rate_hz == rate == drive.set[-1][0]
@@ -64,7 +64,7 @@ def test_the_highest_rate_whose_half_period_is_longer_than_the_delay(late_s, rat
     assert ("does not sustain" in choice.text) is (rate < 250)
 
 
-def test_one_late_cycle_of_a_thousand_is_borne_and_a_second_is_not():
+def test_one_late_cycle_in_a_thousand_is_accepted_and_a_second_is_not():
     assert chosen(PacedDrive(lambda rate, cycle: 0.5 * (cycle == 500))).taken.rate_hz == 250.0
     assert chosen(PacedDrive(lambda rate, cycle: 0.5 * (rate == 250 and cycle in (500, 900)))).taken.rate_hz == 200.0
 
@@ -76,7 +76,7 @@ def test_the_first_cycles_do_not_count():
 def test_a_line_that_does_not_answer_in_time_is_too_fast_as_well():
     choice = chosen(PacedDrive(deaf=lambda rate, cycle: rate > 100 and cycle % 3 == 0))
     assert choice.taken.rate_hz == 100.0
-    assert all(one.cycles < 10 for one in choice.tried[:3])      # given up as soon as it is clear
+    assert all(one.cycles < 10 for one in choice.tried[:3])      # the attempt ends as soon as the result is clear
 
 
 @pytest.mark.heavy
@@ -104,7 +104,7 @@ def test_the_runner_tries_before_motion_and_goes_on_at_that_rate(world):
     assert here.log.run["cycle"]["rate_hz"] == 25.0
 
 
-def test_whoever_named_a_rate_has_it(world):
+def test_a_stated_rate_is_used(world):
     drive = PacedDrive(lambda rate, cycle: 1.0, rates=())
     here = world(drive)
     here.stop_request.ask(signal.SIGINT)
@@ -113,7 +113,7 @@ def test_whoever_named_a_rate_has_it(world):
 
 
 @pytest.mark.heavy
-def test_ctrl_c_ends_the_trying(world):
+def test_ctrl_c_ends_the_choice_of_the_rate(world):
     drive = PacedDrive()
     here = world(drive)
     drive.misbehave = lambda drive, sample: here.stop_request.ask(signal.SIGINT) or sample

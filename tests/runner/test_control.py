@@ -1,4 +1,4 @@
-"""The host's PI on the mean speed: its numbers, its bound, and that it converges behind a reporting lag."""
+"""PI control of the mean speed by the host: gains, limit, and convergence with a reporting lag."""
 
 import pytest
 from hypothesis import given
@@ -44,13 +44,13 @@ def test_it_does_not_wind_up_at_the_bound(sign):
     pi = control(30.0)
     for _ in range(100_000):
         assert pi.update(sign * 5.0, DT_S) == sign * 30.0
-    assert sign * pi.update(-sign * 0.5, DT_S) < 0.0       # turns round at once
+    assert sign * pi.update(-sign * 0.5, DT_S) < 0.0       # reverses at once
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.1, 0.4, 0.5, 2.0])
 @pytest.mark.parametrize("inertia_share", [0.8, 1.0, 1.25])
 def test_it_settles_behind_a_lag_up_to_four_times_the_assumed_one(lag_s, inertia_share):
-    """Plant and lag by small Euler steps; 3 N·m of unknown friction to be found."""
+    """Plant and lag by small Euler steps, with 3 N·m of unknown friction to compensate."""
     pi = control()
     speed, reported = 4.0, 4.0
     history = []

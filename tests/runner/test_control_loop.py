@@ -1,4 +1,4 @@
-"""One cycle: guard, drive, log, guard, display; and what the helpers around it wait for."""
+"""One cycle: guard, drive, log, guard, display; and the conditions that its helpers wait for."""
 
 import itertools
 import signal
@@ -58,7 +58,7 @@ def test_hold_keeps_a_command_for_a_time(world):
     assert len(samples) == 25
     assert here.drive.commands == [REST] * 25
     assert here.display.seen == here.log.cycles == 25
-    assert len(here.bench.hold(REST, 0.0)) == 1     # never nothing
+    assert len(here.bench.hold(REST, 0.0)) == 1     # at least one cycle
 
 
 def test_enable_waits_for_state_and_mode(world):
@@ -109,7 +109,7 @@ def test_the_stop_cycle_is_neither_guarded_nor_stopped_by_log_or_display(world):
     here.log.on_cycle = full
     for _ in range(20):
         here.bench.stop_cycle(REST)
-    assert here.bench.stop_side_troubles == ["OSError: disk full"]          # each is kept once
+    assert here.bench.stop_side_troubles == ["OSError: disk full"]          # each is recorded once
     here.display.on_cycle = no_terminal
     for _ in range(20):
         here.bench.stop_cycle(REST)
@@ -131,7 +131,7 @@ def test_an_observer_that_fails_keeps_no_cycle_of_the_stop_from_the_log(world, m
     assert len(kept) == 5
 
 
-def test_the_stop_cycle_hands_on_what_the_drive_raises(world):
+def test_the_stop_cycle_raises_the_exceptions_of_the_drive(world):
     def gone(drive, sample):
         raise CommunicationLost("gone")
 
@@ -157,7 +157,7 @@ def test_arithmetic_takes_no_cycles_in_stepped_time_and_feeds_the_drive_in_real_
 
 
 def test_in_stepped_time_a_long_computation_gives_signs_of_life_and_no_cycle(world):
-    """A peer in another process takes a silent host for a dead one, and runs on by itself."""
+    """A peer in another process considers a silent host dead and continues in its own time."""
     here = world()
     alive = threading.Event()
     here.drive.keep_alive = alive.set

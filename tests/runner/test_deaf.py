@@ -1,7 +1,7 @@
-"""Arithmetic beside the control loop is never waited for once something ends the run: the stop begins at once.
+"""Computation beside the control loop does not delay the stop: the stop begins at once.
 
-In real time, on a fake drive. The arithmetic here lasts until the shaft has come to rest and the drive has been closed;
-whoever waits for it first waits in vain, and the time-out only keeps that from hanging.
+The tests use real time and a fake drive. The computation lasts until the shaft is at standstill and the drive is
+closed. A stop that waits for it would wait until the time-out.
 """
 
 import signal
@@ -25,17 +25,17 @@ CYCLES = 5                       # of the wait, before the trouble
 
 
 class Endless:
-    """Stands in for a piece of arithmetic: `released` once the run is over, `waited_for` if somebody sat it out."""
+    """Computation that ends once the run is over (`released`). `waited_for`: the run waited for its end."""
 
     def __init__(self, drive):
         self.begun, self.released, self.waited_for = threading.Event(), threading.Event(), False
         self._drive = drive
 
     def __call__(self, *_):
-        self._drive.clock.stepped = False          # from here on: stepped, no cycles are taken meanwhile
+        self._drive.clock.stepped = False          # from here on; in stepped time a computation takes no cycles
         self.begun.set()
         self.waited_for = not self.released.wait(IN_VAIN_S)
-        raise ArithmeticError("nobody asks any more")
+        raise ArithmeticError("the result is no longer needed")
 
 
 @pytest.mark.parametrize(("trouble", "kind"), [("Ctrl-C", Interrupted), ("guard", LimitHit)])
@@ -68,7 +68,7 @@ def test_the_stop_does_not_wait_for_arithmetic(world, monkeypatch, wait, trouble
 
 
 def test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on():
-    """Python and numpy, both at full load; nothing is lost or added on the way out. With the usual way out, OpenBLAS
+    """Python and numpy are at full load, and the output is complete. With the usual exit, OpenBLAS
     sometimes waited for ever.
     """
     program = """
@@ -93,13 +93,13 @@ leave(3)
 
 @pytest.fixture
 def usual_s():
-    """Of the interpreter's switches, once no arithmetic of the tests before goes on that nobody waited for."""
+    """Return the usual switch interval of the interpreter, s, once no computation of earlier tests is running."""
     wait_for("the arithmetic of the tests before", lambda: not thread_computes(), hangs_s=IN_VAIN_S)
     return sys.getswitchinterval()
 
 
 def test_the_interpreter_switches_sooner_until_the_last_piece_of_arithmetic_is_over(usual_s):
-    """Whichever began first: one that was left alone may end before or after the next one."""
+    """An abandoned computation may end before or after the next one."""
     until = [threading.Event() for _ in range(2)]
     first, second = (Background(one.wait) for one in until)
     wait_for("both", lambda: len(background._in_threads) == 2, hangs_s=IN_VAIN_S)
@@ -110,7 +110,7 @@ def test_the_interpreter_switches_sooner_until_the_last_piece_of_arithmetic_is_o
     assert sys.getswitchinterval() == usual_s
 
 
-def test_what_the_arithmetic_raises_is_raised_and_the_interpreter_goes_on_as_before(world, usual_s):
+def test_an_exception_of_the_computation_is_raised_and_the_interpreter_continues(world, usual_s):
     here = world()
     with pytest.raises(SystemExit):
         here.bench.compute(lambda: sys.exit(3), Command(Mode.SPEED, 0.0, 0.0))
@@ -118,7 +118,7 @@ def test_what_the_arithmetic_raises_is_raised_and_the_interpreter_goes_on_as_bef
 
 
 def test_cycles_that_are_late_beside_arithmetic_do_not_end_the_run(world, monkeypatch):
-    """Every one of them, for longer than the guard's look at the pace; afterwards it looks again."""
+    """Every cycle is late, for longer than the guard's window. Afterwards the guard checks the rate again."""
     here = world()
     here.drive.clock.stepped = False
     overruns = []

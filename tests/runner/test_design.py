@@ -1,4 +1,4 @@
-"""The excitation that is chosen: within the limits, as wished, never worse than the usual one, and as good as said."""
+"""Choice of the excitation: within limits, as requested, at least as good as the usual one, as good as predicted."""
 
 import math
 from dataclasses import replace
@@ -64,7 +64,7 @@ def test_the_error_s_density_is_the_one_that_follows_from_the_plant(name):
 
 
 def steady_stretch(seed, speed, load_sd, seconds=6.0, step_s=0.004):
-    """A shaft under a PI speed control, pushed about by a wandering load; reports without lag."""
+    """Return a record of a shaft under PI speed control with a slowly varying load, and reports without lag."""
     rng = np.random.default_rng(seed)
     inertia, viscous, coulomb = 104.0, 8.0, 60.0
     keep, load, integral, omega = np.exp(-step_s / 0.5), load_sd * rng.standard_normal(), 0.0, speed
@@ -91,7 +91,7 @@ def test_the_noise_is_measured_at_steady_speed():
     assert np.mean([one.load_nm2_s for one in found]) == pytest.approx(2.0 * 25.0 * 0.5, rel=0.3)
     assert measured_noise((), theta, fallback) is fallback
     silent = Samples(np.arange(1500) * 0.004, np.full(1500, 3.0), np.full(1500, 84.0))
-    assert measured_noise((silent,), theta, fallback).load_nm2_s > 0.0       # nothing is ever without noise
+    assert measured_noise((silent,), theta, fallback).load_nm2_s > 0.0       # the estimate of the noise is never zero
 
 
 # -- the choice ----------------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def test_the_noise_is_measured_at_steady_speed():
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["servo", "heavy"])
-def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
+def test_the_chosen_motion_is_within_limits_and_has_a_smaller_predicted_uncertainty(name):
     plant = PLANTS[name]
     limits, guess = machine(plant)
     known = DesignKnowledge(true_noise(plant), LagPrior())
@@ -118,7 +118,7 @@ def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
 
 
 @pytest.mark.heavy
-def test_it_repeats_and_says_what_the_estimator_would():
+def test_the_choice_is_reproducible_and_predicts_the_uncertainty_of_the_estimator():
     first, again = (choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95) for _ in range(2))
     assert first == again
     assert first.half_width < first.usual_half_width
@@ -145,7 +145,7 @@ def test_stated_lags_tighten_what_is_expected_and_move_the_lines():
         PlanRequest(kind="sine", frequency_hz=0.3),
     ],
 )
-def test_what_the_user_fixes_rules(wish):
+def test_values_that_the_user_states_are_kept(wish):
     assert choose(LIMITS, GUESS, wish, KNOWN, 0.95).plan == make_plan(LIMITS, GUESS, wish)
 
 
@@ -192,7 +192,7 @@ def hung(**options):
     return replace(KNOWN, has_drill_string=True), PlanRequest(**options)
 
 
-def test_with_a_string_lines_of_equal_torque_reach_from_below_its_swing_to_above_the_second_one():
+def test_with_a_string_lines_of_equal_torque_span_its_first_two_resonances():
     known, wish = hung()
     chosen, usual = choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95), make_plan(STRING_LIMITS, STRING_GUESS)
     assert math.isnan(chosen.half_width)
@@ -213,7 +213,10 @@ def test_with_a_string_a_number_of_periods_does_not_change_the_lines():
 
 
 def motor_sd(plan):
-    """The bound of the shipped string's J_r, reports through filters of two poles and averages; per unit of noise."""
+    """Return the lower bound of the deviation of J_r for the shipped string, per unit of noise.
+
+    The reports pass through filters with two poles and averages.
+    """
     shaft, m = StringShaft(), np.array([1500.0, 23.5, 588.5, 0.959, 1e-3, 15.5, 0.3645, 0.74])
     reference = plan.segments[0].reference
     hertz = np.array(reference.lines_hz)
@@ -230,14 +233,14 @@ def motor_sd(plan):
     )
     problem = Likelihood(lines, Model(shaft), ViscousConstraint(23.5, 0.0, 1.0, 20.0), ())
     whole, _ = problem.information(np.concatenate([m, phi]))
-    sure = np.array([0.0] * 6 + [0.5, 0.5, 0.0, 0.5, 0.0, 0.5, 0.0, 0.0])      # about the bounds of shares and shapes
+    sure = np.array([0.0] * 6 + [0.5, 0.5, 0.0, 0.5, 0.0, 0.5, 0.0, 0.0])      # at the bounds of shares and shapes
     whole += np.diag(np.where(sure > 0.0, 1.0 / np.maximum(sure, 1e-9) ** 2, 0.0))
     scale = 1.0 / np.sqrt(np.diag(whole))
     return float(np.sqrt(np.linalg.inv(whole * np.outer(scale, scale))[0, 0]) * scale[0])
 
 
 @pytest.mark.heavy
-def test_with_a_string_a_fixed_wish_rules_and_too_little_time_leaves_the_usual_choice():
+def test_with_a_string_stated_values_are_kept_and_too_little_time_gives_the_usual_choice():
     known, wish = hung(frequency_hz=0.2)
     assert choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95).plan == make_plan(STRING_LIMITS, STRING_GUESS, wish)
     known, wish = hung()
@@ -255,7 +258,7 @@ def test_a_string_s_tolerance_keeps_its_lines_and_promises_nothing():
     assert "not predicted" in planned.said()
 
 
-def test_where_braking_can_t_be_had_the_motion_asks_for_none():
+def test_without_braking_torque_the_motion_needs_none():
     bitten = RigGuess(1950.0, 50.0, 1000.0, STRING_ERROR)
     free, held = (make_plan(limits, bitten, PlanRequest(offsets_rad_s=(4.0, 6.0)))
                   for limits in (STRING_LIMITS, replace(STRING_LIMITS, least_torque_nm=1000.0)))

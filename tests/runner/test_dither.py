@@ -1,4 +1,4 @@
-"""Slow motion beside the excitation: where, how much, and that it never repeats with the excitation's period."""
+"""Slow dither beside the excitation: when it is used, its size, and its period, which differs from the excitation's."""
 
 import math
 from itertools import pairwise
@@ -16,10 +16,10 @@ from tests.rigs import LIMITS
 RPM = 2.0 * math.pi / 60.0
 
 
-def test_only_where_counts_are_coarse():
+def test_only_for_coarse_resolution():
     assert dither_peak(0.01 * RPM, 9.5) == 0.0
     assert dither_peak(RPM, 9.5) > RPM
-    assert dither_peak(10.0 * RPM, 9.5) <= 0.03 * 9.5 / 2.0          # of the margin that a plan keeps free
+    assert dither_peak(10.0 * RPM, 9.5) <= 0.03 * 9.5 / 2.0          # share of the margin of a plan
 
 
 @given(time=st.floats(0.0, 1e4), period=st.floats(0.1, 100.0), peak=st.floats(0.0, 1.0))
@@ -28,7 +28,7 @@ def test_it_begins_at_zero_and_stays_below_its_peak(time, period, peak):
     assert abs(dither(time, period, peak)) <= peak * (1.0 + 1e-9)
 
 
-def test_no_period_of_the_excitation_meets_it_at_the_same_place():
+def test_it_is_at_a_different_phase_in_each_period_of_the_excitation():
     starts = sorted(dither(20.0 * number, 20.0, 1.0) for number in range(8))
     assert min(b - a for a, b in pairwise(starts)) > 0.02
 
@@ -38,7 +38,7 @@ def test_no_period_of_the_excitation_meets_it_at_the_same_place():
     inertia=st.floats(1.0, 1000.0), coulomb=st.floats(0.0, 80.0), viscous=st.floats(0.0, 5.0),
     period_s=st.sampled_from([0.004, 1.0 / 15.0, 0.1]),
 )
-def test_the_guard_of_a_slow_line_lets_a_plan_in_torque_mode_through(inertia, coulomb, viscous, period_s):
+def test_the_guard_of_a_slow_line_accepts_a_plan_in_torque_mode(inertia, coulomb, viscous, period_s):
     assumptions = ControlAssumptions().at_period(period_s)
     guess = RigGuess(inertia, viscous, coulomb)
     plan = make_plan(MotionLimits(0.5, 10.0, 400.0, Guard.foresight_s(assumptions)), guess)

@@ -1,4 +1,4 @@
-"""Plans stay inside the limits, refuse what doesn't fit, and say exactly what they will do."""
+"""Plans stay within the limits, refuse requests that do not fit, and state the exact motion."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_stays_inside_even_if_the_inertia_is_wrong_by_a_fifth(kind, mode):
 
 
 def test_torque_is_what_the_speed_needs():
-    """Independent: differentiate the reference numerically."""
+    """Compare with the numerical derivative of the reference."""
     plan = make_plan(LIMITS, GUESS)
     for segment in plan.segments:
         reference = segment.reference.reference
@@ -146,7 +146,7 @@ def test_refuses_impossible_machines(limits, guess, word):
         make_plan(MotionLimits(*limits), RigGuess(*guess))
 
 
-def test_wishes_are_kept():
+def test_requested_values_are_kept():
     wish = PlanRequest(kind="sine", frequency_hz=0.3, amplitude_rad_s=0.5, offsets_rad_s=(3.0, 6.0), periods=9)
     plan = make_plan(LIMITS, GUESS, wish)
     assert [segment.reference.offset_rad_s for segment in plan.segments] == [3.0, 6.0]
@@ -155,7 +155,7 @@ def test_wishes_are_kept():
     assert plan.segments[0].periods == 9
 
 
-def test_transition_hands_over_without_a_step():
+def test_transition_has_no_step():
     plan = make_plan(LIMITS, GUESS)
     transition = plan.transition(2.0, 0)
     segment = plan.segments[0].reference
@@ -192,7 +192,7 @@ def test_any_rig_is_planned_inside_its_limits_or_refused(scale, low, width, kind
 
 
 def test_pseudo_random_torque():
-    """Flat over its lines, at one speed for ten minutes; nobody says how tight it will get."""
+    """The spectrum is flat over its lines, at one speed for ten minutes. No half-width is predicted."""
     plan = make_plan(LIMITS, RigGuess(104.0, 8.0, 60.0), PlanRequest(kind="prbs"))
     (segment,) = plan.segments
     reference = segment.reference

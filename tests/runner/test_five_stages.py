@@ -1,4 +1,4 @@
-"""The five stages in order, in either mode, and what ends them: the plan, the mode, the limits."""
+"""The five stages in order, in each mode, and their ends: the plan, the mode, the limits."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def test_the_drive_is_disabled_once_and_after_the_quick_stop(world):
 
 
 def test_a_segment_is_announced_with_its_end_before_it_is_run(world):
-    """A log that ends inside a segment can be read because of it."""
+    """The announcement makes a log readable that ends within a segment."""
     here = world()
 
     def end(stage, cycles):
@@ -103,7 +103,7 @@ def test_an_excitation_that_does_not_fit_what_was_found_in_motion_ends_with_the_
     assert_at_rest(here, result)
 
 
-def test_a_mode_that_the_drive_does_not_take_over_is_found_out(world):
+def test_a_mode_that_the_drive_does_not_confirm_is_a_fault(world):
     here = world(FakeDrive(misbehave=lambda d, s: s._replace(mode=Mode.TORQUE) if s.mode is Mode.SPEED else s))
     result = here.runner().run()
     assert isinstance(result.cause, ModeNotConfirmed)
@@ -111,7 +111,7 @@ def test_a_mode_that_the_drive_does_not_take_over_is_found_out(world):
     assert here.drive.speed == 0.0
 
 
-def test_the_switch_to_torque_mode_is_seeded_with_what_flows(world):
+def test_the_switch_to_torque_mode_begins_with_the_torque_before_it(world):
     here = world()
     here.runner().run()
     commands = here.drive.commands
@@ -130,7 +130,7 @@ def test_the_time_limit_ends_a_run(world):
     assert_at_rest(here, result)
 
 
-def test_a_load_that_lets_go_in_torque_mode_is_caught_inside_the_window(world):
+def test_a_lost_load_in_torque_mode_trips_inside_the_window(world):
     here = world()
 
     def let_go(name, cycles):
@@ -142,7 +142,7 @@ def test_a_load_that_lets_go_in_torque_mode_is_caught_inside_the_window(world):
     assert isinstance(result.cause, LimitHit)
     assert outcomes(result) == up_to("acquire")
     assert result.stop.at_rest_s is not None
-    # A load that drives turns the shaft again as soon as the drive lets go of it, and that is said.
+    # A driving load turns the shaft again once the drive is disabled, and the report states this.
     assert not result.stop.confirmed
     assert "began to turn" in result.stop.trouble[-1]
 
@@ -156,14 +156,14 @@ def test_light_and_heavy_shafts_go_through_alike(world, inertia):
     assert_at_rest(here, result)
 
 
-def test_settings_that_could_not_be_given_back_are_in_the_log(world):
+def test_settings_that_could_not_be_restored_are_in_the_log(world):
     here = world()
     here.drive.left = ("6072h: no answer",)
     assert here.runner().run().cause is None
     assert any("6072h" in event[-1] and "not restored" in event[-1] for event in here.log.events)
 
 
-def test_an_error_of_the_display_during_the_stop_is_told_once(world):
+def test_an_error_of_the_display_during_the_stop_is_reported_once(world):
     here = world()
     said: list[str] = []
 

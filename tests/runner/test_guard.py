@@ -1,4 +1,4 @@
-"""The guard: what trips it, and what doesn't."""
+"""Guard: conditions that trip it, and conditions that do not."""
 
 import math
 from dataclasses import replace
@@ -38,7 +38,7 @@ def test_a_setpoint_outside_the_limits_is_rejected(speed, torque, what):
 
 
 @given(torque=st.floats(-400.0, 400.0), mode=st.sampled_from(Mode))
-def test_a_braking_torque_that_may_not_be_is_held_back_in_torque_mode(torque, mode):
+def test_a_braking_torque_that_is_not_allowed_is_held_back_in_torque_mode(torque, mode):
     watch = guard()
     watch.no_braking, watch.to_brake = "none has been tried", "Try one"
     if mode is Mode.TORQUE and torque < 0.0:
@@ -48,7 +48,7 @@ def test_a_braking_torque_that_may_not_be_is_held_back_in_torque_mode(torque, mo
         watch.check_command(Command(mode, 1.0, torque))
 
 
-def test_a_braking_torque_is_held_back_too_where_nobody_knows_what_would_change_that():
+def test_a_braking_torque_is_held_back_too_without_a_known_remedy():
     watch = guard()
     watch.no_braking = "none has been tried"
     with pytest.raises(LimitHit, match="was not sent") as caught:
@@ -125,7 +125,7 @@ def test_the_time_limit_counts_from_the_first_motion():
         watch.check_sample(REST, sample(time_s=5900.1))
 
 
-def test_reverse_rotation_is_allowed_where_the_rig_says_so():
+def test_reverse_rotation_is_allowed_if_the_rig_permits_it():
     guard(REVERSIBLE).check_sample(REST, sample(-9.9))
 
 
@@ -150,12 +150,12 @@ def test_a_drive_that_leaves_its_state_trips(state):
     [(0.02, 0.5, 13), (0.004, 0.5, 63), (0.001, 5.0, 250), (0.004, 0.1, 13), (0.1, 0.5, 3), (0.5, 5.0, 3)],
 )
 def test_feedback_may_fail_to_come_for_so_many_cycles(period_s, watchdog_s, allowed):
-    """A quarter of a second or half of what the watchdog grants the host, whichever is less; two cycles always."""
+    """The limit is 0.25 s or half of the watchdog time, whichever is less, and at least two cycles."""
     watch = Guard(replace(LIMITS, watchdog_s=watchdog_s), period_s, SPEED_RESOLUTION, TORQUE_RESOLUTION)
     for _ in range(3):
         for _ in range(allowed - 1):
             watch.check_sample(REST, sample(fresh=False))
-        watch.check_sample(REST, sample())              # one that is fresh begins the count anew
+        watch.check_sample(REST, sample())              # a fresh sample restarts the count
     with pytest.raises(CommunicationLost, match=f"no feedback for {allowed} cycles"):
         for _ in range(allowed):
             watch.check_sample(REST, sample(fresh=False))
@@ -166,7 +166,7 @@ def test_feedback_may_fail_to_come_for_so_many_cycles(period_s, watchdog_s, allo
 
 def test_what_the_time_limit_leaves():
     watch = guard()
-    assert watch.left_s(100.0) == 900.0                 # all of it, before the first motion
+    assert watch.left_s(100.0) == 900.0                 # the full time, before the first motion
     watch.start_clock(50.0)
     assert watch.left_s(100.0) == 850.0
 
@@ -175,20 +175,20 @@ def test_what_the_time_limit_leaves():
 
 
 def pace(*steps):
-    """Counters that have grown by (cycles, overruns), looked at in turn."""
+    """Check the pace with counters that grow by these (cycles, overruns), one after the other."""
     watch, cycles, overruns = guard(), 0, 0
     for more, late in steps:
         cycles, overruns = cycles + more, overruns + late
         watch.check_pace(Counters(cycles=cycles, overruns=overruns))
 
 
-def test_a_loop_that_is_late_again_and_again_ends_the_run():
-    pace((100, 20), (100, 20), (99, 99))                # not more than a fifth, and an unfinished stretch
+def test_a_loop_that_is_late_repeatedly_ends_the_run():
+    pace((100, 20), (100, 20), (99, 99))                # at most a fifth, and an incomplete window
     with pytest.raises(CommunicationLost, match="late in 21 of 100 cycles"):
         pace((100, 21))
     with pytest.raises(CommunicationLost):
-        pace((100, 0), (99, 99), (1, 0))                # the stretch counts from the last one's end
-    pace((100, 20), (100, 0))                           # and old overruns are not counted twice
+        pace((100, 0), (99, 99), (1, 0))                # the next window begins at the end of the last one
+    pace((100, 20), (100, 0))                           # and earlier overruns are not counted twice
     pace((100, 20), (100, 20))
 
 
@@ -201,8 +201,8 @@ def test_a_slow_loop_is_judged_by_no_less_than_ten_cycles():
 
 @given(late=st.lists(st.sampled_from([0, 0, 0, 1]), min_size=1, max_size=450), reckoning=st.integers(0, 150),
        before=st.integers(0, 300))
-def test_counters_that_are_read_when_it_is_time_end_the_run_in_the_same_cycle(late, reckoning, before):
-    """As those that are read in every cycle do; ``before``: cycles that the drive has had when the loop begins."""
+def test_counters_that_are_read_only_when_due_end_the_run_in_the_same_cycle(late, reckoning, before):
+    """The result is that of counters read in each cycle. ``before``: cycles of the drive before the loop begins."""
     def ends(due):
         watch, overruns = guard(), 0
         for k, one in enumerate(late):
@@ -222,7 +222,7 @@ def test_counters_that_are_read_when_it_is_time_end_the_run_in_the_same_cycle(la
 
 
 def feed(rows, mode=Mode.TORQUE, *, limits=LIMITS):
-    """(time, setpoint, reported speed, reported torque[, limit active]) in turn."""
+    """Check samples of (time, setpoint, reported speed, reported torque[, limit active]), one after the other."""
     watch = guard(limits)
     for time_s, setpoint, speed, torque, *active in rows:
         command = Command(mode, setpoint, 0.0) if mode is Mode.SPEED else Command(mode, 5.0, setpoint)
@@ -234,7 +234,7 @@ def ramp(end, count=30, start=0.0):
 
 
 @pytest.mark.parametrize(("mode", "limit"), [(Mode.TORQUE, 400.0), (Mode.SPEED, 10.0)])
-def test_feedback_that_stands_still_while_the_setpoint_moves_is_frozen(mode, limit):
+def test_constant_feedback_while_the_setpoint_changes_is_frozen(mode, limit):
     enough, little = 0.2 * limit, 0.09 * limit
     times = [0.02 * k for k in range(30)]
     with pytest.raises(CommunicationLost, match=r"frozen at 5.000 rad/s and 90 N·m for 0.5 s") as raised:
@@ -250,7 +250,7 @@ def test_feedback_that_stands_still_while_the_setpoint_moves_is_frozen(mode, lim
 
 @pytest.mark.parametrize(("mode", "limit", "answer_s"), [(Mode.TORQUE, 400.0, 0.25), (Mode.SPEED, 10.0, 1.0)])
 def test_coarse_reports_of_a_steady_shaft_may_repeat_until_the_setpoint_steps(mode, limit, answer_s):
-    """A drive that reports whole revolutions per minute repeats them at a steady speed. Its answer comes later: a
+    """A drive that reports whole revolutions per minute repeats a value at steady speed. It responds later: to a
     torque within 0.25 s, a speed along the drive's own ramp (seed 1472 of benchmarks/healthy_runs.py)."""
     steady, step, last = [(0.02 * k, 0.0, 5.0, 90.0) for k in range(50)], 0.2 * limit, round(answer_s / 0.02) - 1
     answered = [(1.0 + 0.02 * k, step, 5.0, 90.0 + max(0, k - last)) for k in range(last + 40)]
@@ -259,7 +259,7 @@ def test_coarse_reports_of_a_steady_shaft_may_repeat_until_the_setpoint_steps(mo
         feed(steady + [(1.0 + 0.02 * k, step, 5.0, 90.0) for k in range(last + 3)], mode)
 
 
-def test_any_change_says_that_it_is_not_frozen():
+def test_any_change_shows_that_it_is_not_frozen():
     rows = [(0.02 * k, s, 5.0, 90.0) for k, s in enumerate(ramp(100.0, 60))]
     for change in ({2: 5.01}, {3: 91.0}):
         moved = [list(row) for row in rows]
@@ -294,7 +294,7 @@ def test_a_limit_of_the_drive_may_act_for_a_moment_in_torque_mode_and_always_in_
     assert "bit 11" in caught.value.where
 
 
-def test_a_change_of_mode_begins_the_wait_for_the_limit_anew():
+def test_a_change_of_mode_restarts_the_wait_for_the_limit():
     watch = guard()
     modes = [Mode.TORQUE] * 4 + [Mode.SPEED] + [Mode.TORQUE] * 5
     for k, mode in enumerate(modes):
@@ -302,7 +302,7 @@ def test_a_change_of_mode_begins_the_wait_for_the_limit_anew():
         watch.check_sample(Command(mode, 5.0, 90.0), seen)
 
 
-# -- where and what next -------------------------------------------------------------------------------------------
+# -- place and next step --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def test_a_change_of_mode_begins_the_wait_for_the_limit_anew():
         (Command(Mode.TORQUE, 8.0, 90.0), sample(0.3, 90.0, time_s=1.25)),
     ],
 )
-def test_every_message_says_where_and_what_next(command, seen):
+def test_every_message_states_the_place_and_the_next_step(command, seen):
     watch = guard()
     watch.model = MODEL
     with pytest.raises(TdhilError) as caught:
@@ -330,12 +330,12 @@ def test_every_message_says_where_and_what_next(command, seen):
 
 @pytest.mark.parametrize("limits", [LIMITS, REVERSIBLE])
 def test_noise_about_zero_is_no_reverse_rotation(limits):
-    coarse = Guard(limits, PERIOD_S, 0.1, TORQUE_RESOLUTION)       # five quanta are more than 2 % of the limit
+    coarse = Guard(limits, PERIOD_S, 0.1, TORQUE_RESOLUTION)       # five counts are more than 2 % of the limit
     coarse.check_sample(REST, sample(-0.49))
     guard(limits).check_sample(REST, sample(-0.19))
 
 
-def test_missing_feedback_is_this_computers_where_it_was_late():
+def test_missing_feedback_is_attributed_to_a_late_host():
     watch = guard()
     watch.host_late = lambda: "host or adapter late (40 of 500 cycles, p99 38 ms)"
     with pytest.raises(CommunicationLost, match=r"late \(40 of 500 cycles, p99 38 ms\); no feedback for 13") as caught:
@@ -346,13 +346,13 @@ def test_missing_feedback_is_this_computers_where_it_was_late():
     assert caught.value.where.startswith("host")
 
 
-def test_arithmetic_beside_the_loop_may_make_it_late():
+def test_a_computation_beside_the_loop_may_delay_it():
     watch = guard()
     watch.reckoning = True
     watch.check_pace(Counters(cycles=100, overruns=60))
     watch.check_pace(Counters(cycles=200, overruns=120))
     watch.reckoning = False
-    watch.check_pace(Counters(cycles=300, overruns=125))          # counted from its end on
+    watch.check_pace(Counters(cycles=300, overruns=125))          # the count begins at its end
     with pytest.raises(CommunicationLost, match="late in 30 of 100"):
         watch.check_pace(Counters(cycles=400, overruns=155))
 
@@ -366,7 +366,7 @@ def test_a_torque_offset_beyond_what_the_stage_may_command_is_rejected(offset):
         watch.check_command(OFFSET._replace(torque_offset_nm=offset))
 
 
-def test_no_torque_offset_is_commanded_where_no_stage_has_asked_for_one_nor_in_torque_mode():
+def test_no_torque_offset_is_accepted_without_a_request_of_the_stage_or_in_torque_mode():
     watch = guard()
     with pytest.raises(CommandRejected, match="torque offset"):
         watch.check_command(OFFSET)
@@ -384,7 +384,7 @@ def test_a_torque_offset_moves_the_shaft_from_its_reference_and_the_window_is_he
         watch.check_sample(OFFSET, sample(0.5 * LIMITS.speed_min_rad_s, time_s=17.0))
 
 
-def test_feedback_that_stands_still_while_the_torque_offset_moves_is_none():
+def test_constant_feedback_while_the_torque_offset_changes_is_frozen():
     watch = guard()
     watch.expected = PowerState.ENABLED
     watch.allow_torque_offset(20.0)
@@ -396,7 +396,7 @@ def test_feedback_that_stands_still_while_the_torque_offset_moves_is_none():
 
 @given(speed=st.floats(-1.0, 12.0), torque=st.floats(-500.0, 500.0), commanded=st.floats(-400.0, 400.0))
 def test_a_string_under_load_moves_no_limit(speed, torque, commanded):
-    """What is known of its swing is for the message alone."""
+    """The known oscillation is used for the message only."""
     said = []
     for disturbed in ("", "the string below swings by ±1200 N·m every 5.3 s"):
         held = guard()
@@ -410,7 +410,7 @@ def test_a_string_under_load_moves_no_limit(speed, torque, commanded):
 
 
 @pytest.mark.parametrize(("speed", "commanded"), ((0.4, 60.0), (9.9, 400.0), (10.1, 60.0)))
-def test_it_is_named_where_its_swing_takes_the_shaft_out_of_the_window(speed, commanded):
+def test_the_message_names_the_string_if_its_oscillation_exceeds_the_window(speed, commanded):
     held = guard()
     held.model, held.disturbed = MODEL, "the string below swings by ±1200 N·m every 5.3 s"
     with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s") as hit:

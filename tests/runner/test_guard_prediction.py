@@ -1,4 +1,4 @@
-"""Where the guard expects the shaft to be, and the window's ends in torque mode."""
+"""Speed that the guard predicts, and the ends of the speed window in torque mode."""
 
 from dataclasses import replace
 
@@ -34,16 +34,16 @@ def test_prediction_looks_as_far_as_lag_and_reaction():
     assert far.predicted_speed(MODEL, 190.0, 4.0) == pytest.approx(4.0 + 100.0 / 50.0 * 2.0)
 
 
-def test_torque_that_leads_out_of_the_window_trips_before_the_speed_is_there():
+def test_torque_that_leads_out_of_the_window_trips_before_the_speed_does():
     watch = guard()
     watch.model = MODEL
     # 10 = ω + (T − 50 − 10 ω)·0.6/70 at ω = 8: T = 130 + 2·70/0.6 = 363.3
     watch.check_sample(Command(Mode.TORQUE, 8.0, 363.0), sample(8.0, 363.0))
     with pytest.raises(LimitHit, match="about to leave its window"):
         watch.check_sample(Command(Mode.TORQUE, 8.0, 364.0), sample(8.0, 364.0))
-    watch.check_sample(Command(Mode.SPEED, 8.0, 364.0), sample(8.0, 364.0))     # the drive's own loop holds it
+    watch.check_sample(Command(Mode.SPEED, 8.0, 364.0), sample(8.0, 364.0))     # the drive's own loop holds the speed
     watch.model = None
-    watch.check_sample(Command(Mode.TORQUE, 8.0, 364.0), sample(8.0, 364.0))    # nothing known yet
+    watch.check_sample(Command(Mode.TORQUE, 8.0, 364.0), sample(8.0, 364.0))    # J and friction are not known yet
 
 
 @given(
@@ -68,7 +68,7 @@ def test_the_prediction_alone_decides_in_torque_mode(speed, torque, inertia, vis
 
 
 def by_hand(speed, torque, coulomb, viscous, inertia, horizon=0.6, steps=60_000):
-    """The shaft itself, by small steps, with friction that holds at standstill."""
+    """Integrate the motion of the shaft in small steps, with friction that holds at standstill."""
     dt = horizon / steps
     for _ in range(steps):
         if speed == 0.0:
@@ -85,7 +85,7 @@ def by_hand(speed, torque, coulomb, viscous, inertia, horizon=0.6, steps=60_000)
 @pytest.mark.parametrize("speed", [0.0, 0.2, 1.0, 4.0, -0.3])
 @pytest.mark.parametrize("torque", [-400.0, -200.0, -40.0, 0.0, 40.0, 300.0])
 def test_prediction_is_where_a_shaft_with_friction_goes(speed, torque):
-    """Against small steps; viscous friction is held at its first value, which is all that the two may differ by."""
+    """Compare with small steps. The only difference: the prediction keeps viscous friction constant."""
     found = guard().predicted_speed(MODEL, torque, speed)
     true = by_hand(speed, torque, 50.0, 10.0, 70.0)
     assert found == pytest.approx(true, abs=0.06 * abs(found - speed) + 0.02)
@@ -108,12 +108,12 @@ def test_torque_that_would_turn_the_shaft_backwards_trips_while_it_still_turns_f
     assert guard().predicted_speed(MODEL, -300.0, 0.6) == pytest.approx(-1.72, abs=0.01)
     with pytest.raises(LimitHit, match="about to turn backwards"):
         torque_mode(-300.0, 0.6)
-    torque_mode(-300.0, 4.0)            # does not come to rest within what is foreseen
-    torque_mode(-45.0, 0.6)             # friction holds what it has stopped
-    torque_mode(-70.0, 0.52)            # backwards, but by less than noise
+    torque_mode(-300.0, 4.0)            # does not come to standstill within the prediction
+    torque_mode(-45.0, 0.6)             # friction holds the stopped shaft
+    torque_mode(-70.0, 0.52)            # backwards, but within noise
 
 
-def test_where_it_may_turn_backwards_the_speed_limit_holds_there_too():
+def test_with_reverse_allowed_the_speed_limit_applies_backwards_too():
     reversible = replace(REVERSIBLE, speed_min_rad_s=-10.0)
     torque_mode(-300.0, 0.6, reversible)
     torque_mode(-300.0, -8.0, reversible)
@@ -137,7 +137,7 @@ def test_a_slow_loop_reacts_late(period_s, reaction):
     assert watch.predicted_speed(MODEL, 190.0, 4.0) == pytest.approx(4.0 + 100.0 / 70.0 * (reaction + 0.5))
 
 
-def test_what_a_plan_must_keep_free_is_what_is_foreseen():
+def test_the_margin_of_a_plan_is_that_of_the_prediction():
     assumptions = ControlAssumptions(largest_speed_lag_s=0.7, reaction_s=0.2, smallest_inertia_share=0.9)
     assert Guard.foresight_s(assumptions) == pytest.approx(1.0)
     assert Guard.room(LIMITS, assumptions, 0.25) == MotionLimits(0.75, 9.75, 400.0, Guard.foresight_s(assumptions))

@@ -1,4 +1,4 @@
-"""A run that measures the drive's own impedance: stages, limits, and what becomes of the offset when it ends."""
+"""Run that measures the impedance of the drive: stages, limits, and removal of the torque offset at its end."""
 
 from dataclasses import replace
 
@@ -52,13 +52,13 @@ def test_the_offset_stays_within_its_share_of_the_torque_limit_and_is_gone_befor
     rising = np.flatnonzero(sent)
     assert np.all(sent[rising[-1] + 1 :] == 0.0)
     step = np.max(np.abs(np.diff(sent)))
-    assert step < 0.25 * LARGEST_NM        # faded in and out: nothing jumps
+    assert step < 0.25 * LARGEST_NM        # faded in and out without a step
     assert abs(sent[rising[-1]]) < 0.05 * LARGEST_NM
     assert measured.outcome.stop.confirmed and measured.drive.disabled_at == pytest.approx([0.0], abs=0.01)
 
 
 @pytest.mark.heavy
-def test_what_the_shaft_does_is_what_was_planned(measured):
+def test_the_motion_is_as_planned(measured):
     plan = measured.display.plans[0]
     excited = measured.recording.time_s > measured.recording.excitation.segments[0].start_s
     ended = measured.recording.time_s < measured.recording.excitation.segments[0].end_s
@@ -86,7 +86,7 @@ def test_a_loop_with_a_small_integral_gain_is_stopped_with_its_cause():
 
 
 class Ending(LineDrive):
-    """Does something once the offset is at work."""
+    """Line that misbehaves once the torque offset acts."""
 
     act = staticmethod(lambda drive, sample: sample)
     acts_after = 300
@@ -101,7 +101,7 @@ class Ending(LineDrive):
 
 
 def lost_torque(drive, sample):
-    """Half of the shaft's torque is gone, as with a limit that somebody lowered."""
+    """Lower the torque limit of the drive, so that half of the torque is lost."""
     drive.inverter.control.limits.torque_forward_nm = 20.0
     return sample
 
@@ -160,7 +160,7 @@ def test_an_interrupt_takes_it_away_as_well():
         (replace(OFFSET, frequency_hz=0.2), LIMITS, "chooses its excited frequencies itself"),
     ],
 )
-def test_what_it_can_not_be_measured_with_is_refused(request_, limits, words):
+def test_unsuitable_drives_and_rigs_are_refused(request_, limits, words):
     found = drive().preflight(DriveLimits(10.0, 400.0, 2.0, 0.5, torque_offset=True))
     with pytest.raises(PreflightRefused, match=words):
         choose_mode(request_, limits, found)

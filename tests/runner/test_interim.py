@@ -1,4 +1,4 @@
-"""J during stage 5: asked for at ends of periods only, never in a cycle's way, and the same as at the end."""
+"""J during stage 5: computed at ends of periods only, without a delay of cycles, and equal to the final J."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOUND = LiveInertia(1.0, 3, 0.95, "valid", "because", 104.0, 103.0, 105.0, 100.0
 
 
 class Viewer(FakeDisplay):
-    """A display that can show J."""
+    """Display that can show J."""
 
     follows_inertia = True
 
@@ -43,14 +43,14 @@ class Viewer(FakeDisplay):
 
 
 class Log(BuilderLog):
-    """What a watch needs of a log."""
+    """The part of a log that a watch uses."""
 
     def recording(self, *, complete):
         return None
 
 
 class Worker:
-    """A worker process that answers when it is let go."""
+    """Worker process that answers once ``go`` is set."""
 
     def __init__(self):
         self.go, self.asked = threading.Event(), []
@@ -72,7 +72,7 @@ def watch_of(stepped, worker=None, viewer=None, **more):
 
 @pytest.fixture
 def answered(monkeypatch):
-    """No arithmetic: what was asked."""
+    """Replace the computation and return the list of its requests."""
     asked = []
 
     def answer(recording, question):
@@ -106,13 +106,13 @@ def test_in_stepped_time_answers_come_by_control_time_alone(answered):
     assert answered[0] == Interim(MOTION, identify_plainly, 0.95, 0.95, None, None)
 
 
-def test_with_a_tolerance_it_says_when_the_run_may_end_and_what_looking_costs(answered):
+def test_with_a_tolerance_it_shows_when_the_run_may_end_and_the_cost_of_interim_looks(answered):
     watch, _, _ = watch_of(True, working=lambda: 0.97, tolerance=0.01)
     watch.period_ended(MOTION, 5.0)
     assert answered == [Interim(MOTION, identify_plainly, 0.95, 0.97, 0.01, 5.0)]
 
 
-def test_in_real_time_no_cycle_waits_and_the_answers_keep_to_their_share_of_a_core(monkeypatch):
+def test_in_real_time_no_cycle_waits_and_the_computation_keeps_to_its_share_of_a_core(monkeypatch):
     now = SimpleNamespace(s=100.0)
     monkeypatch.setattr(interim, "time", SimpleNamespace(monotonic=lambda: now.s))
     worker, viewer = Worker(), Viewer()
@@ -120,7 +120,7 @@ def test_in_real_time_no_cycle_waits_and_the_answers_keep_to_their_share_of_a_co
     watch.period_ended(MOTION, 5.0)
     watch.look()
     now.s += 60.0
-    watch.period_ended(MOTION, 5.0)           # the first has not come: no second one
+    watch.period_ended(MOTION, 5.0)           # no second request before the first answer
     assert viewer.answers == []
     worker.go.set()
     pending = watch._pending
@@ -137,7 +137,7 @@ def test_in_real_time_no_cycle_waits_and_the_answers_keep_to_their_share_of_a_co
 
 
 @pytest.mark.parametrize("worker", [None, SimpleNamespace(ask=lambda work: 1 / 0)])
-def test_without_the_worker_process_there_are_no_answers_and_the_log_says_so(worker):
+def test_without_the_worker_process_there_are_no_results_and_the_log_states_it(worker):
     viewer = Viewer()
     watch, _, log = watch_of(False, worker, viewer)
     watch.period_ended(MOTION, 5.0)
@@ -185,7 +185,7 @@ def test_a_recording_in_parts_is_the_recording():
         other.join(replace(builder.part(), begin=7))
 
 
-def test_the_worker_process_keeps_the_samples_and_a_first_part_begins_anew():
+def test_the_worker_process_keeps_the_samples_and_a_first_part_restarts_them():
     asked, builder = Interim(MOTION, identify_plainly, 0.95, 0.95), filled(20)
     for _ in range(2):
         assert answer_with(builder.part(), asked).found.inertia_kg_m2 is None
@@ -196,7 +196,7 @@ def test_the_worker_process_keeps_the_samples_and_a_first_part_begins_anew():
 
 
 class Asked:
-    """A watch that notes the questions."""
+    """Watch that records its calls."""
 
     def __init__(self):
         self.motions, self.left_s, self.looks = [], [], 0
@@ -230,7 +230,7 @@ def test_it_is_asked_after_whole_periods_and_the_setpoints_are_the_same(world):
 
 @pytest.mark.heavy
 def test_the_live_answer_is_the_final_one_on_the_same_samples():
-    """The samples are those of the log up to then, and J is what a replay of so much of the log gives."""
+    """The samples are those of the log so far, and J is that of a replay of this part of the log."""
     log, viewer, lengths = BuilderLog(), Viewer(), []
     task = Task(LIMITS, ExcitationRequest(periods=5), {"torque_scale_rel_sd": 0.02})
 

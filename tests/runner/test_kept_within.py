@@ -1,6 +1,6 @@
-"""What the stages keep to by themselves, before the guard would have to: the torque limit, and an end to coasting.
+"""Limits that the stages keep before the guard acts: the torque limit, and the end of coasting.
 
-A setpoint that the guard rejects is a mistake of this program, and ends the run; so no stage may make one.
+A setpoint that the guard rejects is an error of this program and ends the run, so no stage may request one.
 """
 
 import math
@@ -21,11 +21,11 @@ ROOM = MotionLimits(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torqu
 
 
 class Seen(Exception):
-    """Enough cycles."""
+    """End the stage after enough cycles."""
 
 
 def turning(world, drive=None, speed=5.0, cycles=50):
-    """In torque mode, at a speed; the display ends it after so many cycles more."""
+    """Turn at a speed in torque mode; the display ends the stage after ``cycles`` more cycles."""
     here = world(drive or FakeDrive())
     here.turn(speed, Mode.TORQUE)
     here.drive.commands.clear()
@@ -47,7 +47,7 @@ def torques(here):
     (5.0, 8.0, 500.0, 400.0), (0.5, 1.0, 0.0, -400.0),
 ])
 def test_hold_keeps_to_the_torque_limit(world, start_rad_s, target_rad_s, friction_nm, end_nm):
-    """A model with too much friction, or a shaft that is much faster than it was taken for."""
+    """The model has too much friction, or the shaft is much faster than expected."""
     model = RigGuess(200.0, 0.0, friction_nm)
     here = turning(world, FakeDrive(inertia=1e4), speed=9.0 if end_nm < 0.0 else start_rad_s)
     control = MeanSpeedControl(model, 1000.0, ControlAssumptions())
@@ -81,7 +81,7 @@ def test_acquire_keeps_to_it_with_what_the_slow_loop_adds(world):
 ])
 @pytest.mark.parametrize("slow_loop", [False, True])
 def test_a_reference_that_is_no_number_becomes_no_limit(world, mode, speed_rad_s, torque_nm, slow_loop):
-    """Held to a limit it would be that limit: full torque, or the highest speed."""
+    """A clamp to the limits would turn it into full torque or the highest speed."""
     here = turning(world)
     control = MeanSpeedControl(RigGuess(200.0, 8.0, 60.0), 1000.0, ControlAssumptions()) if slow_loop else None
     with pytest.raises(CommandRejected, match="not finite"):
@@ -89,12 +89,12 @@ def test_a_reference_that_is_no_number_becomes_no_limit(world, mode, speed_rad_s
     assert here.drive.commands == []
 
 
-def test_nor_does_the_seed_of_torque_mode():
+def test_a_first_torque_that_is_no_number_becomes_no_limit():
     assert math.isnan(kept_within(NAN, 0.0, 400.0))
 
 
-def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):
-    """It would, of a shaft that is faster than it should be; the guard would end the run on it."""
+def test_the_slow_loop_requests_no_braking_torque_where_it_is_not_allowed(world):
+    """A shaft above the set speed would need braking torque, and the guard would end the run."""
     model = RigGuess(200.0, 0.0, 50.0)
     for stage in ("hold", "acquire"):
         here = turning(world, FakeDrive(inertia=1e4), speed=9.0)
@@ -107,8 +107,8 @@ def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):
         assert min(torques(here)) == 0.0
 
 
-def test_coasting_ends_where_nothing_slows_the_shaft(world):
-    """Friction was taken too high by far: after twice the planned time it is held again."""
+def test_coasting_ends_if_the_shaft_does_not_slow_down(world):
+    """The assumed friction is far too high: after twice the planned time the speed is held again."""
     guess = RigGuess(100.0, 2.0, 20.0)
     way = SpeedChange(6.0, 2.0, 5.0, guess, coasting=True)
     plan = SpeedChangePlan("coast-down", "torque", 6.0, (way,), 2.0, 6.0, 0.0, 100.0, ROOM, guess)

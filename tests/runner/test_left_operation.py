@@ -1,4 +1,4 @@
-"""A drive that left operation in motion: did the reported torque stop the shaft?"""
+"""Drive that left operation in motion: test of whether the reported torque stopped the shaft."""
 
 import math
 
@@ -18,7 +18,7 @@ def point(time_s, speed_rad_s, impulse_nms):
 
 
 def followed(torque_nm, from_rad_s=2.0, lag_s=0.4, stop_s=1.0, later_nm=0.0):
-    """A reported speed that lags a ramp to zero, beside a constant torque while it falls; ``later_nm`` from 3 s on."""
+    """Observe a reported speed that lags a ramp to zero, with a constant torque. ``later_nm``: torque from 3 s on."""
     points = [point(0.0, from_rad_s, 0.0)]
     left, speed, impulse = LeftOperation(points[0]), from_rad_s, 0.0
     for k in range(1, 120):
@@ -40,7 +40,7 @@ def test_without_a_bound_of_j_nothing_is_known():
 
 
 def test_torque_after_the_stop_does_not_count():
-    """An error of the torque's zero would add up to any impulse."""
+    """An offset of the torque signal would accumulate to any impulse."""
     assert not followed(0.0, later_nm=-50.0).braked(J_KG_M2)
 
 
@@ -55,7 +55,7 @@ def test_nothing_is_known_before_the_next_point():
 
 
 def test_the_torque_that_still_drives_is_no_braking_and_the_speed_counts_at_its_largest():
-    """The report lags: after the fault it still shows torque in the direction of motion, and a speed that rises."""
+    """The report lags: after the fault it still shows a driving torque and a rising speed."""
     left = LeftOperation(point(0.0, 1.0, 0.0))
     for at, speed, impulse in ((0.2, 2.0, 40.0), (0.6, 1.0, 25.0), (1.0, 0.0, 10.0)):
         left.see(point(at, speed, impulse), turns=speed > 0.2)

@@ -1,4 +1,4 @@
-"""An aborted run is never taken up again: the next one begins with its own connection, preflight and stage 1."""
+"""An aborted run is not resumed: the next run begins with its own connection, preflight and stage 1."""
 
 import subprocess
 import sys
@@ -31,7 +31,7 @@ def test_after_an_abort_in_any_stage_a_run_begins_anew(world, stage):
     assert aborted.stages[-1].name == stage
     assert here.drive.state is PowerState.OFF
     said = [call for call in here.drive.calls if call != "exchange"]
-    assert said[-2:] == ["disable", "close"]          # nothing is left enabled that could be taken up again
+    assert said[-2:] == ["disable", "close"]          # the drive is not left enabled, so no run can be resumed
 
     again = World(here.drive)
     before = len(here.drive.calls)
@@ -50,7 +50,7 @@ def test_no_option_of_a_run_takes_up_an_older_one():
 
 
 @pytest.mark.heavy
-def test_what_reads_a_log_of_an_aborted_run_has_no_drive_at_hand(tmp_path):
+def test_code_that_reads_the_log_of_an_aborted_run_has_no_access_to_a_drive(tmp_path):
     script = (
         "import sys\n"
         "from pathlib import Path\n"

@@ -1,4 +1,4 @@
-"""The observer alone: a shaft that does what it is reported to do is believed, and a report that lies is found."""
+"""Observer alone: it accepts true reports of a shaft and finds false reports."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tests.runner.reporting_rig import LIMITS, Bench, Reports, Rig
 COUNT_RAD = 2.0 * math.pi / 8192
 PLAIN, WITH_POSITION = Rig(), Rig(position_count=COUNT_RAD)
 STIFF = Rig(coulomb=80.0, viscous=15.0)
-"""Friction takes a third of the torque limit: enough for a torque report to be held against it."""
+"""Rig whose friction is a third of the torque limit, enough to check a torque report with it."""
 LAGS = (0.0, 0.1, 0.5)
 SPEED_AND_TORQUE = frozenset({Signal.SPEED, Signal.TORQUE})
 SPEED_AND_ANGLE = frozenset({Signal.SPEED, Signal.ANGLE})
 
 
 def frozen(bench, *signals):
-    """A lie: these reports keep the value that they have now."""
+    """Freeze these reports at their present value."""
     kept = bench.samples[-1]
     values = {"speed_rad_s": kept.speed_rad_s, "torque_nm": kept.torque_nm, "position_rad": kept.position_rad}
     stuck = {name: values[name] for name in signals or values}
@@ -33,14 +33,14 @@ def frozen(bench, *signals):
 
 
 def changed(signal, scale=1.0, offset=0.0):
-    """A lie: this report has another scale or another zero."""
+    """Give this report another scale or another offset."""
     def lie(reports: Reports):
         return reports._replace(**{signal: scale * getattr(reports, signal) + offset})
     return lie
 
 
 def ramps(bench):
-    """Between 4 and 6 rad/s, with a second of each."""
+    """Ramp between 4 and 6 rad/s, with one second at each speed."""
     for speed in (6.0, 4.0):
         bench.ramp(speed)
         bench.hold(1.0, speed)
@@ -51,9 +51,9 @@ def ramps(bench):
 
 @st.composite
 def rigs(draw):
-    """A rig that can do what is asked of it, with reports of any plausible lag and resolution."""
+    """Return a rig with enough torque for its motion, and reports with any plausible lag and resolution."""
     top = draw(st.sampled_from([2.0, 10.0, 150.0]))
-    acceleration = draw(st.floats(0.1, 1.0)) * top            # of its torque limit without friction, rad/s²
+    acceleration = draw(st.floats(0.1, 1.0)) * top            # at its torque limit without friction, rad/s²
     inertia = 10.0 ** draw(st.floats(-3.0, 3.5))
     limit = inertia * acceleration
     limits = replace(
@@ -70,7 +70,7 @@ def rigs(draw):
     )
 
 
-PHASES = (Phase.explicit, Phase.reuse, Phase.generate)      # a smaller rig is no simpler one
+PHASES = (Phase.explicit, Phase.reuse, Phase.generate)      # a smaller rig is not a simpler one
 any_run = given(rigs(), st.floats(-1.0, 1.0), st.floats(0.05, 0.3), st.floats(0.05, 1.0), st.integers(0, 1000))
 
 
@@ -95,7 +95,7 @@ def test_many_healthy_runs_raise_no_doubt(rig, wrong, rel_error, frequency_hz, s
 
 
 def healthy(rig, wrong, rel_error, frequency_hz, seed):
-    """Standstill, sign probe, levels, torque mode about a mean speed, ramps under speed control, and the stop."""
+    """Run standstill, sign probe, operating points, torque mode, ramps under speed control, and the stop."""
     bench, top = Bench(rig, seed), rig.limits.speed_max_rad_s
     bench.first_levels()
     assert bench.observer.doubt is None, bench.observer.doubt
@@ -120,8 +120,8 @@ def healthy(rig, wrong, rel_error, frequency_hz, seed):
 @pytest.mark.parametrize("speed_lag_s", [0.1, 0.3, 0.45, 0.5])
 @pytest.mark.parametrize("coulomb", [100.0, 371.0, 500.0])
 @pytest.mark.parametrize("quick_stop_rad_s2", [1.0, 1.8, 2.2, 3.0])
-def test_a_late_speed_goes_on_falling_once_friction_has_stopped_the_shaft(speed_lag_s, coulomb, quick_stop_rad_s2):
-    """At true standstill static friction takes any torque, while the reported speed is still on its way to zero."""
+def test_a_lagging_speed_still_falls_once_friction_has_stopped_the_shaft(speed_lag_s, coulomb, quick_stop_rad_s2):
+    """Static friction holds any torque at standstill, while the reported speed still falls to zero."""
     limits = replace(LIMITS, torque_nm=1856.0, quick_stop_rad_s2=quick_stop_rad_s2)
     rig = Rig(inertia=300.0, viscous=37.0, coulomb=coulomb, limits=limits, speed_lag_s=speed_lag_s, torque_lag_s=0.3)
     bench = Bench(rig).begun(3.0)
@@ -130,7 +130,7 @@ def test_a_late_speed_goes_on_falling_once_friction_has_stopped_the_shaft(speed_
     assert bench.observer.reports_trusted
 
 
-def test_nothing_is_doubted_of_a_shaft_that_never_moves():
+def test_no_report_is_doubted_while_the_shaft_never_moves():
     bench = Bench(replace(PLAIN, coulomb=1e6))
     bench.probe()
     assert bench.observer.doubt is None
@@ -151,7 +151,7 @@ JUMPS = {
 @pytest.mark.parametrize("name", JUMPS)
 @pytest.mark.parametrize("mode", ["speed", "torque"])
 def test_a_speed_that_jumps_is_found_at_once(name, lag_s, mode):
-    """No torque changes the speed so fast; a few points are enough, whatever the lag."""
+    """The torque cannot change the speed so fast. A few points are enough for any lag."""
     bench = Bench(replace(PLAIN, speed_lag_s=lag_s, torque_lag_s=0.5 * lag_s)).begun()
     if mode == "torque":
         bench.excite(4.0, 5.0, 1.0)
@@ -167,7 +167,7 @@ def test_a_speed_that_jumps_is_found_at_once(name, lag_s, mode):
 
 @pytest.mark.parametrize("lag_s", LAGS)
 def test_a_lost_encoder_is_found_before_the_shaft_is_fast(lag_s):
-    """The drive's speed control accelerates with all its torque: within the time in which that reaches the limit."""
+    """The speed control accelerates with full torque. The doubt comes before the shaft reaches the speed limit."""
     bench = Bench(replace(PLAIN, speed_lag_s=lag_s)).begun()
     bench.sensor = lambda _: 0.0
     assert bench.found_after(3.0, lambda: bench.hold(0.02, 5.0)) is not None
@@ -179,7 +179,7 @@ def test_a_lost_encoder_is_found_before_the_shaft_is_fast(lag_s):
 @pytest.mark.parametrize("lag_s", LAGS)
 @pytest.mark.parametrize("how", ["ramps", "torque mode"])
 def test_a_speed_that_freezes_is_found_once_the_shaft_turns_otherwise(lag_s, how):
-    """Torque goes on and speed does not: within 4 s, the longest window."""
+    """The torque changes and the speed does not. The doubt comes within 4 s, the longest window."""
     bench = Bench(replace(PLAIN, speed_lag_s=lag_s)).begun()
     if how == "torque mode":
         bench.excite(4.0, 5.0, 1.0)
@@ -213,7 +213,7 @@ def test_a_torque_that_lies_is_found_in_torque_mode(name, lag_s):
 
 @pytest.mark.parametrize("lag_s", LAGS)
 def test_half_a_torque_is_found_where_it_is_nearly_steady(lag_s):
-    """155 N·m are commanded in the mean of 4 s, and half of it is reported."""
+    """The mean command over 4 s is 155 N·m, and half of it is reported."""
     bench = Bench(replace(STIFF, speed_lag_s=lag_s, torque_lag_s=0.5 * lag_s)).begun()
     bench.excite(5.0, 5.0, 0.1)
     bench.lie = changed("torque_nm", 0.5)
@@ -226,7 +226,7 @@ def test_half_a_torque_is_found_where_it_is_nearly_steady(lag_s):
 
 @pytest.mark.parametrize("name", TORQUES)
 def test_a_torque_that_lies_is_found_under_speed_control(name):
-    """Nothing is commanded there: friction and inertia alone contradict it, and half of it may be true."""
+    """Only friction and inertia contradict the report without a torque command, and half a torque is plausible."""
     scale, within_s = TORQUES[name]
     bench = Bench(STIFF).begun()
     bench.lie = changed("torque_nm", scale)
@@ -236,10 +236,10 @@ def test_a_torque_that_lies_is_found_under_speed_control(name):
 
 
 def test_torque_alone_is_doubted_where_it_contradicts_its_command():
-    """From the start, as a wrong unit in the profile: the speed is still believed, and so is standstill."""
+    """The error exists from the start, like a wrong unit in the profile. Speed and standstill are still accepted."""
     bench = Bench(STIFF, lie=changed("torque_nm", 0.5))
     bench.first_levels()
-    assert bench.observer.doubt is None             # J and friction are learned from the same report
+    assert bench.observer.doubt is None             # J and friction are estimated from the same report
     bench.excite(8.0, 4.0, 0.2)
     assert bench.observer.doubt is not None
     assert bench.observer.doubt.signals == frozenset({Signal.TORQUE})
@@ -248,7 +248,7 @@ def test_torque_alone_is_doubted_where_it_contradicts_its_command():
 
 @pytest.mark.parametrize(("name", "moved_rad_s"), [("dead", 5.0), ("half", 5.0), ("sign", 5.0), ("double", 5.0)])
 def test_a_position_that_does_not_go_as_far_as_the_speed_says(name, moved_rad_s):
-    """Half of the way, and more, is missing within a second."""
+    """Half of the travel or more is missing within a second."""
     bench = Bench(WITH_POSITION).begun()
     here = bench.angle
     bench.lie = {
@@ -265,7 +265,7 @@ def test_a_position_that_does_not_go_as_far_as_the_speed_says(name, moved_rad_s)
 def test_the_position_finds_a_frozen_speed_however_little_torque_it_takes():
     bench = Bench(WITH_POSITION).begun()
     bench.lie = frozen(bench, "speed_rad_s")
-    bench.ramp(3.0, 0.2)                             # so slow that torque hardly changes
+    bench.ramp(3.0, 0.2)                             # so slow that the torque hardly changes
     bench.hold(2.0, 3.0)
     assert bench.observer.doubt is not None
     assert Signal.SPEED in bench.observer.doubt.signals
@@ -273,7 +273,7 @@ def test_the_position_finds_a_frozen_speed_however_little_torque_it_takes():
 
 @pytest.mark.parametrize("speed_lag_s", [1.2, 2.0])
 def test_a_filter_slower_than_assumed_is_named_beside_the_contradiction(speed_lag_s):
-    """The position shows a reported speed that lags more than any drive should: the shaft stops, and the text names
+    """The position shows that the speed lags more than is plausible. The shaft is stopped, and the message names
     the lag to state in rig.yaml.
     """
     bench = Bench(replace(WITH_POSITION, speed_lag_s=speed_lag_s)).begun()
@@ -323,8 +323,8 @@ def test_during_the_first_ramp_an_encoder_that_dies_is_found_by_the_torque_at_it
     assert Signal.SPEED in bench.observer.doubt.signals
 
 
-def test_of_a_shaft_that_was_never_seen_to_move_nothing_can_be_said_but_how_long_it_may_turn():
-    """The encoder is dead from the start: a locked shaft reports the same. So it gets time to run out."""
+def test_for_a_shaft_without_observed_motion_only_the_coasting_time_is_known():
+    """The encoder is dead from the start. A locked shaft gives the same reports, so the stop allows time to coast."""
     bench = Bench(PLAIN, sensor=lambda _: 0.0)
     bench.probe()
     assert bench.observer.doubt is None and not bench.observer.moved
@@ -336,9 +336,9 @@ def test_of_a_shaft_that_was_never_seen_to_move_nothing_can_be_said_but_how_long
     assert bench.speed == 0.0
 
 
-def test_a_motion_that_was_seen_needs_no_time_to_run_out():
+def test_an_observed_motion_needs_no_coasting_time():
     bench = Bench(PLAIN)
-    assert bench.observer.unseen_s == 0.0            # no torque was applied either
+    assert bench.observer.unseen_s == 0.0            # nor does a shaft without applied torque
     bench.probe()
     assert bench.observer.moved and bench.observer.unseen_s == 0.0
 
@@ -349,9 +349,9 @@ def test_a_position_that_moves_is_a_motion_too():
     assert bench.observer.moved and bench.observer.unseen_s == 0.0
 
 
-def test_blind_s_is_long_enough_for_friction_to_stop_what_lags_hide():
+def test_blind_s_is_long_enough_for_friction_to_stop_a_motion_that_lags_hide():
     bench = Bench(PLAIN)
-    assert bench.observer.blind_s == 0.0             # nothing is known
+    assert bench.observer.blind_s == 0.0             # no estimates
     bench = Bench(PLAIN).begun()
     hidden = 0.5 * PLAIN.friction(0.5) / PLAIN.inertia       # half a second of lag, rad/s
     assert 0.0 < bench.observer.blind_s <= 5.0
@@ -360,7 +360,7 @@ def test_blind_s_is_long_enough_for_friction_to_stop_what_lags_hide():
     assert bench.speed == 0.0
 
 
-# -- the first contradiction, and what becomes of it ----------------------------------------
+# -- the first contradiction and its consequences -------------------------------------------
 
 
 def test_the_first_contradiction_stays():
@@ -376,8 +376,8 @@ def test_the_first_contradiction_stays():
     assert bench.observer.doubt is first
 
 
-def test_a_torque_beyond_its_limit_is_false_even_at_rest():
-    """Nothing else contradicts it there: static friction may hold any torque."""
+def test_a_torque_beyond_its_limit_is_false_even_at_standstill():
+    """This is the only rule at standstill, where static friction may hold any torque."""
     bench = Bench(PLAIN, lie=changed("torque_nm", offset=1.3 * LIMITS.torque_nm))
     bench.hold(0.2, 0.0)
     assert bench.observer.doubt.signals == frozenset({Signal.TORQUE})
@@ -396,7 +396,7 @@ def test_a_stop_knows_whether_the_shaft_turned_when_it_began(speed):
     assert bench.observer.turned is (speed > 0.0)
 
 
-def test_a_contradiction_says_what_why_and_what_next():
+def test_a_contradiction_states_the_report_the_reason_and_the_next_step():
     bench = Bench(PLAIN).begun()
     bench.lie = JUMPS["lost"]
     bench.hold(0.5, 5.0)
@@ -420,7 +420,7 @@ def test_a_speed_that_stays_frozen_is_not_believed_again(rig):
     bench.ramp(2.0)
     bench.hold(2.0, 2.0)
     assert bench.observer.doubt is not None
-    bench.lie = lambda one: one._replace(speed_rad_s=0.0)    # as a gateway that notices it late
+    bench.lie = lambda one: one._replace(speed_rad_s=0.0)    # as with a gateway that detects it late
     bench.quick_stop(0.1)
     if not rig.position_count:
         bench.quick_stop(10.0)
@@ -440,13 +440,13 @@ def test_a_position_that_lives_stands_in_for_a_lost_speed():
     assert not bench.observer.angle_stands(1e-6)               # one count of this position is more
 
 
-def test_a_shaft_without_a_position_has_none_that_stands():
+def test_without_a_position_there_is_no_constant_position():
     bench = Bench(PLAIN).begun()
     bench.quick_stop(8.0)
     assert bench.observer.angle_quiet(0.05) and not bench.observer.angle_stands(0.05)
 
 
-def test_a_position_that_goes_on_is_no_standstill():
+def test_a_position_that_moves_is_no_standstill():
     bench = Bench(WITH_POSITION).begun()
     bench.lie = JUMPS["lost"]
     bench.hold(2.0, 5.0)
@@ -454,7 +454,7 @@ def test_a_position_that_goes_on_is_no_standstill():
 
 
 @pytest.mark.parametrize("left", [0.1, 0.4])
-def test_a_lost_load_is_a_lighter_shaft_and_its_speed_lives(left):
+def test_after_a_lost_load_the_speed_of_the_lighter_shaft_is_valid(left):
     bench = Bench(PLAIN).begun()
     bench.excite(4.0, 5.0, 1.0)
     bench.rig = replace(PLAIN, inertia=left * PLAIN.inertia, coulomb=left * PLAIN.coulomb, viscous=left * PLAIN.viscous)
@@ -465,19 +465,19 @@ def test_a_lost_load_is_a_lighter_shaft_and_its_speed_lives(left):
     assert bench.observer.doubt is not None
     assert bench.fastest < 1.5 * LIMITS.speed_max_rad_s
     assert bench.quick_stop(12.0) == ""
-    assert bench.observer.reports_trusted                 # it came down as a shaft does
+    assert bench.observer.reports_trusted                 # it fell as the speed of a shaft does
     assert bench.observer.doubt.lighter
     assert "load" in bench.observer.doubt.helps
 
 
-# -- what is no feedback ----------------------------------------
+# -- missing feedback -------------------------------------------
 
 
 @pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("gap_s", [0.6, 3.0])
 @pytest.mark.parametrize("seen", ["nothing", "stale samples"])
-def test_a_gap_in_the_feedback_begins_anew(gap_s, seen):
-    """The shaft did something else meanwhile; what comes after the gap is compared with itself alone."""
+def test_a_gap_in_the_feedback_restarts_the_comparison(gap_s, seen):
+    """The motion during the gap is unknown. Reports after the gap are compared only with each other."""
     bench = Bench(WITH_POSITION).begun()
     see = bench.observer.see
     last = bench.samples[-1]
@@ -519,7 +519,7 @@ FAULTS = {
 @pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_shaft_that_accelerates_against_the_quick_stop_is_seen_in_two_ways(name, rig):
-    """Before it is faster than the limit and what the torque does within 2 s more."""
+    """Both come before the shaft exceeds the limit by what the torque adds within 2 s."""
     bench = Bench(rig).begun()
     for what, value in FAULTS[name].items():
         setattr(bench, what, value)
@@ -541,7 +541,7 @@ def test_a_sensor_that_is_dead_in_the_stop_is_seen_in_two_ways(value, rig):
 
 
 def test_with_a_dead_sensor_a_tenth_of_the_torque_limit_counts_as_pushing():
-    """The friction of a shaft whose speed is unknown may be less than was learned: it holds 155 N·m here, not 100."""
+    """With an unknown speed, friction may be less than estimated. Here it holds 155 N·m, not 100 N·m."""
     bench = Bench(STIFF).begun()
     bench.sensor = lambda _: 0.0
     bench.hold(0.3, 5.0)
@@ -549,8 +549,8 @@ def test_with_a_dead_sensor_a_tenth_of_the_torque_limit_counts_as_pushing():
     assert "push the shaft on" in bench.quick_stop(4.0)
 
 
-def test_one_way_is_not_enough():
-    """A reported speed that rises and nothing else: the shaft itself comes to rest."""
+def test_one_kind_of_evidence_is_not_sufficient():
+    """Only the reported speed rises; the shaft comes to standstill."""
     bench = Bench(PLAIN).begun()
     bench.state = PowerState.QUICK_STOP
     bench.lie = lambda one: one._replace(speed_rad_s=max(5.0, 10.0 - one.speed_rad_s))
@@ -560,7 +560,7 @@ def test_one_way_is_not_enough():
 
 
 def test_a_speed_that_does_not_change_under_the_torque_limit_of_a_stop_is_doubted():
-    """Nothing is known of the shaft, so that any inertia would fit."""
+    """J is unknown, so any inertia would fit."""
     observer = Observer(LIMITS, PLAIN.period_s, PLAIN.speed_count)
     observer.begin_stop()
     for k in range(500):
@@ -570,7 +570,7 @@ def test_a_speed_that_does_not_change_under_the_torque_limit_of_a_stop_is_doubte
     assert "the torque limit, brake the shaft for 8 s" in observer.doubt.what
 
 
-def test_nothing_runs_away_before_a_quick_stop_was_asked_for():
+def test_no_runaway_is_reported_before_a_quick_stop_is_requested():
     bench = Bench(PLAIN, stuck_nm=None).begun()
     bench.stuck_nm = 200.0
     bench.hold(3.0, 5.0)
@@ -579,7 +579,7 @@ def test_nothing_runs_away_before_a_quick_stop_was_asked_for():
 
 @pytest.mark.parametrize("name", ["stuck", "inverted"])
 def test_above_a_drill_string_the_torque_is_left_on_below_the_speed_limit(name):
-    """A string that is let go turns back: only a shaft that is beyond its limit is let go."""
+    """A released string turns back, so the torque is removed only above the speed limit."""
     rig = replace(WITH_POSITION, limits=replace(LIMITS, load="string", torque_ramp_nm_s=40.0))
     bench = Bench(rig).begun()
     for what, value in FAULTS[name].items():
@@ -590,13 +590,13 @@ def test_above_a_drill_string_the_torque_is_left_on_below_the_speed_limit(name):
     assert len(how.split("; ")) >= 2
 
 
-# -- above a drill string, and what later showed ----------------------------------------
+# -- above a drill string, and later cases -------------------------------------------
 
 ABOVE_A_STRING = replace(PLAIN, limits=replace(LIMITS, load="string", torque_ramp_nm_s=40.0))
 
 
 def test_above_a_string_a_frozen_speed_at_the_torque_limit_is_found_within_seconds():
-    """The drive pushes on with all it has, since its frozen speed stays below the setpoint."""
+    """The drive accelerates with full torque, since the frozen speed stays below the setpoint."""
     bench = Bench(ABOVE_A_STRING)
     bench.first_levels()
     kept = bench.speed
@@ -616,7 +616,7 @@ def test_above_a_string_a_frozen_speed_is_found_by_the_torque_that_should_have_m
 
 
 def test_a_setpoint_that_steps_above_a_string_is_no_frozen_speed():
-    """A late report hardly moves at first; that is not counted."""
+    """A lagging report hardly changes at first. This time does not count."""
     bench = Bench(replace(ABOVE_A_STRING, speed_lag_s=0.5, torque_lag_s=0.5)).begun()
     for speed in (5.0, 5.2, 5.0, 6.0, 5.0):
         bench.hold(4.0, speed)
@@ -625,7 +625,7 @@ def test_a_setpoint_that_steps_above_a_string_is_no_frozen_speed():
 
 @pytest.mark.parametrize("step_rad_s", [0.8, -0.8])
 def test_a_torque_step_at_the_end_of_stage_2_is_no_load_of_a_string(step_rad_s):
-    """The speed shows it a lag later, and only points since then show the load."""
+    """The speed responds after its lag. Only later points show the load."""
     bench = Bench(replace(ABOVE_A_STRING, speed_lag_s=0.4, limits=replace(ABOVE_A_STRING.limits, torque_nm=800.0)))
     bench.first_levels()
     bench.know(0.4, 0.5)
@@ -636,7 +636,7 @@ def test_a_torque_step_at_the_end_of_stage_2_is_no_load_of_a_string(step_rad_s):
     assert bench.observer.doubt is None
 
 
-def test_a_shaft_that_is_told_to_yield_and_stands_is_not_believed():
+def test_a_reported_standstill_despite_a_commanded_yield_is_not_believed():
     bench = Bench(ABOVE_A_STRING).begun()
     bench.ramp(0.0)
     bench.hold(2.0, 0.0)
@@ -684,7 +684,7 @@ def test_a_scale_that_changed_within_stage_2_contradicts_the_first_ramp(factor, 
 
 
 def test_an_inverted_polarity_is_a_second_way_where_no_position_is_reported():
-    """The motor pushes the other way than its current says: the speed rises as the opposite torque would have it."""
+    """The motor torque is opposite to its current: the speed rises according to the opposite torque."""
     bench = Bench(PLAIN).begun()
     bench.polarity = -1.0
     how = bench.quick_stop(20.0)
@@ -692,7 +692,7 @@ def test_an_inverted_polarity_is_a_second_way_where_no_position_is_reported():
     assert abs(bench.speed) < 2.0 * LIMITS.speed_max_rad_s
 
 
-def test_a_position_that_ceases_to_come_is_no_witness():
+def test_a_position_that_is_no_longer_reported_is_not_used():
     bench = Bench(WITH_POSITION).begun()
     bench.lie = lambda reports: reports._replace(speed_rad_s=0.0)
     bench.hold(1.0, 5.0)
@@ -706,7 +706,7 @@ def test_a_position_that_ceases_to_come_is_no_witness():
     assert not bench.observer.reports_trusted and not bench.observer.comes_down
 
 
-def test_standstill_is_held_more_closely_once_a_report_was_in_doubt():
+def test_standstill_is_checked_more_strictly_once_a_report_was_in_doubt():
     bench = Bench(PLAIN).begun()
     assert bench.observer.rest_rad_s(0.05) == 0.05
     bench.lie = changed("speed_rad_s", 0.5)

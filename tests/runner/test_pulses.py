@@ -1,4 +1,4 @@
-"""Torque pulses and coast-down: planned within the window, run, identified by both routes, and refused where unfit."""
+"""Torque pulses and coast-down: plan within the window, run, identification by both routes, and refusals."""
 
 import math
 from dataclasses import replace
@@ -62,7 +62,7 @@ def test_a_plan_stays_within_window_and_torque(
     assert plan.duration_s == pytest.approx(CALM_S + sum(way.duration_s + CALM_S for way in plan.ways))
 
 
-def test_wishes_are_taken_at_their_word_or_refused():
+def test_requested_values_are_kept_or_refused():
     plan = plan_speed_changes("pulses", LIMITS, GUESS, "torque", amplitude_rad_s=1.0, offset_rad_s=5.0, swings=9)
     assert (len(plan.ways), plan.speed_min_rad_s, plan.speed_max_rad_s) == (9, 4.0, 6.0)
     assert plan_speed_changes("pulses", LIMITS, GUESS, "torque").duration_s <= TOTAL_S
@@ -77,7 +77,7 @@ def test_wishes_are_taken_at_their_word_or_refused():
 
 
 def test_coasting_time_obeys_the_equation_of_motion():
-    """Independent: Euler steps of J dω/dt = −B ω − T_c."""
+    """Compare with Euler steps of J dω/dt = −B ω − T_c."""
     speed, time = 7.0, 0.0
     while speed > 2.0:
         speed -= 1e-4 * (8.0 * speed + 60.0) / 104.0
@@ -107,7 +107,7 @@ def test_no_frequency_and_no_more_time_than_there_is(kind):
         ("coast-down", 20, None, {"speed change", "coast-down"}),
     ],
 )
-def test_both_routes_tell_the_inertia(kind, rate_hz, mode, routes):
+def test_both_routes_give_the_inertia(kind, rate_hz, mode, routes):
     run = run_line(LineDrive(Line(1.0 / rate_hz), seed=4), ExcitationRequest(kind, mode))
     assert run.outcome.cause is None, run.outcome.cause
     assert run.outcome.stop.confirmed
@@ -117,7 +117,7 @@ def test_both_routes_tell_the_inertia(kind, rate_hz, mode, routes):
     time_s = run.recording.time_s
     during = run.recording.speed_rad_s[(time_s >= acquired.start_s) & (time_s <= acquired.end_s)]
     assert kind != "coast-down" or during.min() > 3.0     # each coasting ends at the lower speed, 3.3 rad/s
-    found = identify(run.recording, Options(tolerance=0.2))     # unknown lags may leave it wide on one side
+    found = identify(run.recording, Options(tolerance=0.2))     # unknown lags may make the interval wide on one side
     assert found.verdict is Verdict.VALID
     assert found.inertia.value == pytest.approx(TRUE_KG_M2, rel=0.03)
     assert found.inertia.low <= TRUE_KG_M2 <= found.inertia.high
@@ -125,7 +125,7 @@ def test_both_routes_tell_the_inertia(kind, rate_hz, mode, routes):
     assert all(opinion.agrees for opinion in found.second_opinions)
 
 
-def test_coast_down_is_refused_before_motion_where_it_can_not_be():
+def test_coast_down_is_refused_before_motion_where_it_is_not_possible():
     speed_only = LineDrive(Line(0.02), modes=frozenset({Mode.SPEED}))
     outcome = run_line(speed_only, ExcitationRequest("coast-down")).outcome
     assert isinstance(outcome.cause, PreflightRefused)

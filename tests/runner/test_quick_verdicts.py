@@ -1,4 +1,4 @@
-"""What the observer decides in a short cut is what its full comparison says."""
+"""Short cuts of the observer agree with its full comparison."""
 
 import random
 from collections import deque
@@ -15,7 +15,7 @@ from tests.rigs import LIMITS
 WAY = Way(0, 0.0, 1.0)
 
 
-def test_a_torque_that_explains_the_slope_by_itself_is_what_all_torques_explain(monkeypatch):
+def test_if_the_torque_explains_the_slope_all_torques_together_explain_it(monkeypatch):
     rng = random.Random(3)
     short = full = 0
     for _ in range(300):

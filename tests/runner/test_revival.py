@@ -1,4 +1,4 @@
-"""A speed after a contradiction: does it come down as a shaft does under a quick stop?"""
+"""Reported speed after a contradiction: test of whether it falls as that of a shaft under a quick stop."""
 
 import pytest
 

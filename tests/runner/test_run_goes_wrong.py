@@ -1,4 +1,4 @@
-"""Whatever goes wrong in any of the five stages: the shaft is stopped, and the first cause kept."""
+"""Failures in each of the five stages: the shaft is stopped, and the first cause is kept."""
 
 import signal
 
@@ -73,7 +73,7 @@ def test_a_display_that_fails_as_a_stage_begins(world, stage):
 @pytest.mark.heavy(but_first=3)
 @EACH_STAGE
 def test_a_log_that_is_broken_for_good(world, stage):
-    """Disk full: every later call fails as well, those of the stop and of the end of the stage included."""
+    """The disk is full: every later call fails too, including those of the stop and of the end of the stage."""
     here = world()
     error = LogError("disk full")
 
@@ -100,7 +100,7 @@ def test_a_stop_request_in_each_stage(world, stage, signum):
 
     def press(name, cycles):
         if name == stage and cycles >= after(stage):
-            here.stop_request.ask(signum)      # again and again: the stop's own cycles are shown too
+            here.stop_request.ask(signum)      # repeatedly: the display shows the cycles of the stop too
 
     here.display.on_cycle = press
     result = here.runner().run()
@@ -126,10 +126,10 @@ def test_a_drive_fault_in_each_stage(world, stage):
     result = here.runner().run()
     assert isinstance(result.cause, DriveFault)
     assert outcomes(result) == up_to(stage)
-    # At the beginning of stage 2 the shaft is slow, and J is not known: a lost signal would fall as its speed does.
+    # At the beginning of stage 2 the shaft is slow and J is unknown. A lost signal would fall as its speed does.
     assert result.stop.confirmed is (stage != "speed")
     assert here.drive.speed == 0.0
-    assert here.drive.state is PowerState.FAULT     # left for the operator to see
+    assert here.drive.state is PowerState.FAULT     # not changed, so that the operator sees it
 
 
 @EACH_STAGE
@@ -208,7 +208,7 @@ def test_what_fails_while_closing_is_the_cause_only_where_there_is_no_other(worl
 
 
 @pytest.mark.heavy
-def test_a_stop_that_is_not_confirmed_after_a_good_run_shows(world):
+def test_an_unconfirmed_stop_after_a_good_run_is_reported(world):
     here = world(FakeDrive(brakes=False))
     here.drive.coulomb = here.drive.viscous = 0.0
 

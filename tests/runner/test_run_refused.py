@@ -1,4 +1,4 @@
-"""What is refused before anything moves, and what the sign probe finds out at walking pace."""
+"""Refusals before motion, and findings of the sign probe at low speed."""
 
 import signal
 from dataclasses import replace
@@ -31,12 +31,12 @@ def test_a_refused_confirmation_moves_nothing(world):
         assert task.limits is LIMITS
         assert preflight.watchdog_s == 0.5
         for _ in range(50):
-            idle()                                  # feeds the watchdog while somebody thinks
+            idle()                                  # feeds the watchdog while the operator decides
         raise PreflightRefused("not confirmed")
 
     result = here.runner(confirm=refuse).run()
     assert isinstance(result.cause, PreflightRefused)
-    assert here.drive.cycles == 100                 # a second of standstill, and the idle cycles
+    assert here.drive.cycles == 100                 # a second of standstill and the idle cycles
     assert {(command.speed_rad_s, command.torque_nm) for command in here.drive.commands} == {(0.0, 0.0)}
     assert_nothing_moved(here, result)
 
@@ -55,7 +55,7 @@ def test_a_stop_request_at_the_prompt_moves_nothing(world):
     assert_nothing_moved(here, result)
 
 
-def test_a_refused_preflight_moves_nothing_and_says_how_to_mend_it(world):
+def test_a_refused_preflight_moves_nothing_and_states_the_remedy(world):
     here = world(FakeDrive(refused=(refused_check(), refused_check())))
     asked = []
     result = here.runner(confirm=lambda *_: asked.append(1)).run()
@@ -100,7 +100,7 @@ def test_a_shaft_that_already_turns_is_left_alone(world, speed_rad_s, reported_r
 
 
 @pytest.mark.heavy
-def test_a_fault_is_reset_on_the_operator_s_word_only(world):
+def test_a_fault_is_reset_with_the_operators_consent_only(world):
     for word in (False, True):
         here = world(FakeDrive(state=PowerState.FAULT, wish=PowerState.FAULT))
         result = here.runner(reset_fault=word).run()
@@ -109,7 +109,7 @@ def test_a_fault_is_reset_on_the_operator_s_word_only(world):
 
 
 @pytest.mark.parametrize("mode", ["torque", "speed"])
-def test_an_inverted_sign_is_found_at_walking_pace(world, mode):
+def test_an_inverted_sign_is_found_at_low_speed(world, mode):
     here = world(FakeDrive(direction=-1.0))
     fastest = []
     here.display.on_cycle = lambda *_: fastest.append(abs(here.drive.speed))
@@ -154,7 +154,7 @@ def test_a_torque_above_that_of_the_probe_ends_it_in_speed_mode_and_is_named(wor
     assert max(command.speed_rad_s for command in here.drive.commands) == pytest.approx(0.3, abs=0.01)
 
 
-def test_the_probe_goes_no_farther_than_it_may(world):
+def test_the_probe_keeps_to_its_travel(world):
     """Reported speed is noise about zero while the shaft creeps."""
     here = world()
     here.limits = replace(LIMITS, probe_travel_rad=0.02)
@@ -165,7 +165,7 @@ def test_the_probe_goes_no_farther_than_it_may(world):
 
 
 class TightDrive(FakeDrive):
-    """Its own limits were tighter than the rig's, and stayed."""
+    """Drive whose own limits are tighter than those of the rig, and stay."""
 
     kept = (None, None)
 
@@ -201,8 +201,8 @@ def test_the_run_keeps_within_the_drive_s_own_limits(world):
     assert (limits.torque_nm, limits.probe_torque_nm, limits.speed_max_rad_s) == (150.0, 150.0, 4.0)
 
 
-def test_a_plan_that_this_shaft_is_too_heavy_for_ends_in_its_own_words(world):
-    """It has moved by then: a limit leaves no room, and the shaft was stopped."""
+def test_a_plan_for_a_shaft_that_is_too_heavy_ends_with_its_own_message(world):
+    """The shaft has already moved: a limit leaves no room, and the shaft is stopped."""
     here = world()
     request = ExcitationRequest(kind="sine", frequency_hz=2.0, amplitude_rad_s=2.0, offset_rad_s=5.0, periods=3)
     outcome = here.runner(request).run()

@@ -1,4 +1,4 @@
-"""Acceleration against a quick stop: what the torque since the stop accounts for, point by point."""
+"""Acceleration during a quick stop: evidence of the torque since the stop, point by point."""
 
 from types import SimpleNamespace
 
@@ -46,7 +46,7 @@ def test_a_torque_that_repeats_counts_as_long_as_it_repeats():
 
 @pytest.mark.parametrize("before", [[], varied(0.5, 0.0)], ids=["from the start", "later"])
 def test_a_torque_that_repeated_and_then_went_on_was_late(before):
-    """Reports that stay for 2 s and then go on were delayed: the stop had begun long before.
+    """Reports that are constant for 2 s and then continue were delayed: the stop had begun long before.
 
     `lying_reports.py`, number 3683: the torque of a shaft that braked was removed.
     """
@@ -58,7 +58,7 @@ def test_after_a_delay_the_torque_counts_again():
     assert "accounts for" in by_torque([*late, *varied(4.0)])
 
 
-def test_a_single_repeated_point_is_none():
+def test_a_single_repeated_point_is_no_delay():
     pairs = [pair for _ in range(14) for pair in (*repeated(0.2), (START_RAD_S + 1e-3, PUSHING_NM))]
     assert REPEATED_S > 2.0 * EVERY_S
     assert "accounts for" in by_torque(pairs)

@@ -1,4 +1,4 @@
-"""All five stages on lines of 10 to 100 Hz, with and without torque mode, and what the recording keeps of the line."""
+"""All five stages on lines of 10 to 100 Hz, with and without torque mode, and data of the line in the recording."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -35,7 +35,7 @@ def test_a_slow_line_identifies(rate_hz, modes):
 
 
 @pytest.mark.heavy
-def test_signals_read_one_after_the_other_are_told_apart_by_their_skew():
+def test_signals_read_one_after_the_other_have_a_time_offset():
     run = run_line(LineDrive(Line(0.1, apart=True), seed=6))
     found = identified(run)
     assert found.inertia.low <= TRUE_KG_M2 <= found.inertia.high
@@ -46,7 +46,7 @@ def test_signals_read_one_after_the_other_are_told_apart_by_their_skew():
 
 
 @pytest.mark.heavy
-def test_without_torque_mode_two_stages_say_what_they_could_not_do():
+def test_without_torque_mode_two_stages_state_why_they_are_skipped():
     run = run_line(LineDrive(Line(0.05), modes=SPEED_ONLY), ExcitationRequest(periods=2))
     assert run.outcome.cause is None
     torque, hold = run.outcome.stages[2:4]
@@ -59,7 +59,7 @@ def test_without_torque_mode_two_stages_say_what_they_could_not_do():
 
 @pytest.mark.heavy
 def test_the_rate_is_written_down_once_it_is_known():
-    """`LineDrive.period_s` fails if anybody asks before preflight."""
+    """`LineDrive.period_s` raises if it is read before preflight."""
     run = run_line(LineDrive(Line(0.1), modes=SPEED_ONLY), ExcitationRequest(periods=2))
     assert run.log.run["cycle"] == {"period_s": 0.1, "rate_hz": pytest.approx(10.0)}
     assert ("rate", "10 cycles per second") in run.log.events
@@ -69,7 +69,7 @@ def test_the_rate_is_written_down_once_it_is_known():
 
 @pytest.mark.heavy
 def test_torque_read_in_step_with_a_stiff_drive_is_not_trusted():
-    """Every 100 ms the drive answers a step of its setpoint within some 30 ms, unfiltered: most of it is never seen."""
+    """The drive is read every 100 ms and follows a step within about 30 ms. Most of the response is lost."""
     stiff = COARSE.drive.model_copy(update={
         "speed_gain_nm_s_rad": 1500.0, "speed_integral_gain_nm_rad": 3000.0, "speed_filter_s": 0.0,
         "torque_limit_nm": 2000.0,
@@ -87,7 +87,7 @@ def test_torque_read_in_step_with_a_stiff_drive_is_not_trusted():
 
 
 @pytest.mark.heavy
-def test_a_ramp_in_the_drive_is_seen_and_stayed_below():
+def test_a_ramp_in_the_drive_is_found_and_not_exceeded():
     run = run_line(LineDrive(Line(0.05), modes=SPEED_ONLY, ramp_rad_s2=0.8, seed=3))
     found = identified(run)
     plan = run.display.plans[0]

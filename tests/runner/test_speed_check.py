@@ -1,4 +1,4 @@
-"""The angle that a drive counts against the speed that it reports, as far as no drive is needed for it."""
+"""Comparison of the reported angle and speed, without a drive."""
 
 import math
 
@@ -15,7 +15,7 @@ def sample(time_s):
 
 
 def compared(late_s, *, factor=1.0, half_width_s=0.001, seconds=4.0):
-    """What is known after so long; ``late_s(cycle)``: how long after its sample the angle of a cycle is read."""
+    """Return the result after this time. ``late_s(cycle)``: delay between a sample and the reading of its angle."""
     angles = Angles()
     for cycle in range(round(seconds / PERIOD_S)):
         time_s = cycle * PERIOD_S
@@ -31,17 +31,17 @@ def compared(late_s, *, factor=1.0, half_width_s=0.001, seconds=4.0):
 ], ids=["never", "always", "at the end", "more and more"])
 @pytest.mark.parametrize("factor", [1.0, 2.0, 0.5])
 def test_a_host_that_was_late_sees_the_same_ratio(late, factor):
-    """The shaft turned on between a sample and the reading behind it."""
+    """The shaft turns between a sample and the later reading of the angle."""
     assert compared(late, factor=factor).value == pytest.approx(factor, rel=0.005)
 
 
-def test_what_is_not_known_of_time_is_not_known_of_the_ratio():
+def test_an_uncertainty_of_time_is_one_of_the_ratio():
     sharp, dull = compared(lambda cycle: 0.0), compared(lambda cycle: 0.0, half_width_s=0.01)
     assert dull.half_width > sharp.half_width + 0.004
     assert compared(lambda cycle: 0.0, half_width_s=0.2) is None
 
 
-def test_an_angle_that_moves_without_any_reported_speed_has_a_ratio_all_the_same():
+def test_an_angle_that_moves_without_reported_speed_has_a_ratio():
     angles, backwards = Angles(), Angles()
     for cycle in range(100):
         time_s = cycle * PERIOD_S

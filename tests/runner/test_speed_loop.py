@@ -1,4 +1,4 @@
-"""How a drive follows its setpoint, read off a ramp that an independent integration made."""
+"""Response of a drive to its setpoint, estimated from ramps of an independent integration."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ STEP_S = 0.001
 
 
 def course(gain, integral, lag_s, period_s, ramp=np.inf, noise=0.0):
-    """J = 1: a PI speed loop on a bare shaft, stepped every period towards a ramp; (time, setpoint, reported)."""
+    """Return (time, setpoint, reported) of a PI speed loop on a bare shaft with J = 1, for a ramp."""
     speed = total = seen = reference = 0.0
     rows, every = [], round(period_s / STEP_S)
     rng = np.random.default_rng(1)
@@ -47,7 +47,7 @@ def test_its_filters_are_scipys():
 @pytest.mark.heavy
 @settings(max_examples=6, deadline=None)
 @given(gain=st.floats(1.5, 8.0), damping=st.floats(0.7, 1.3), period_s=st.sampled_from([0.02, 0.05, 0.1]))
-def test_the_loop_is_read_off_a_ramp(gain, damping, period_s):
+def test_the_loop_is_estimated_from_a_ramp(gain, damping, period_s):
     integral = (0.5 * gain / damping) ** 2
     found = fit_following(*course(gain, integral, 0.3, period_s, noise=0.003), 0.3)
     hertz = np.array([0.05, 0.1, 0.2, 0.4])
@@ -57,14 +57,14 @@ def test_the_loop_is_read_off_a_ramp(gain, damping, period_s):
     assert found.reported(hertz) == pytest.approx(found.shaft(hertz) / (1.0 + 0.3 * s))
 
 
-def test_a_ramp_of_the_drive_s_own_is_told_from_a_drive_that_keeps_up():
+def test_a_ramp_in_the_drive_is_distinguished_from_a_drive_that_follows():
     assert held_back_to(*course(4.0, 4.0, 0.3, 0.05)) is None
     signals = course(4.0, 4.0, 0.3, 0.05, ramp=0.2)
     assert held_back_to(*signals) == pytest.approx(0.2, rel=0.08)
     assert fit_following(*signals, 0.3, 0.2) is not None
 
 
-def test_nothing_is_read_off_a_speed_that_does_not_follow():
+def test_no_loop_is_estimated_from_a_speed_that_does_not_follow():
     time, setpoint, reported = course(4.0, 4.0, 0.3, 0.05)
     assert fit_following(time, setpoint, np.random.default_rng(2).normal(size=len(time))) is None
     assert fit_following(time, 0.0 * setpoint, reported) is None
@@ -73,7 +73,7 @@ def test_nothing_is_read_off_a_speed_that_does_not_follow():
 
 
 def test_a_plan_leaves_room_for_a_loop_that_overshoots():
-    """Driven through the loop, the shaft stays within the window that the plan kept with its margin."""
+    """A simulation of the loop shows that the shaft stays within the window, thanks to the margin of the plan."""
     limits = MotionLimits(0.5, 10.0, 1e6)
     following = fit_following(*course(1.5, 2.0, 0.0, 0.02))
     plain = make_plan(limits, RigGuess(1.0), PlanRequest(mode="speed"))

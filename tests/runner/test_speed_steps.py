@@ -34,7 +34,7 @@ def in_acquire(here, cycle, what):
     here.display.on_cycle = lambda stage, seen: what() if (stage, seen) == ("acquire", cycle) else None
 
 
-def test_the_steps_stay_within_the_limits_and_end_at_rest(world):
+def test_the_steps_stay_within_the_limits_and_end_at_standstill(world):
     here = world(FakeDrive(), LIMITS)
     result = runner(here).run()
     assert result.cause is None
@@ -127,7 +127,7 @@ def test_a_speed_that_overshoots_far_more_than_predicted_is_stopped(world):
 @pytest.mark.parametrize(("what", "cause"), [
     (lambda here: here.stop_request.ask(), Interrupted), (lambda here: here.drive.fault(), DriveFault),
 ], ids=["stop", "fault"])
-def test_every_end_of_the_steps_is_at_standstill(world, what, cause):
+def test_the_steps_always_end_at_standstill(world, what, cause):
     here = world(FakeDrive(), LIMITS)
     in_acquire(here, 50, lambda: what(here))
     result = runner(here).run()

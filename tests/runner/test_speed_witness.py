@@ -1,4 +1,4 @@
-"""The check of the unit of speed in stage 2, on a shaft in a few lines: no bus, no guard, no clock of the computer."""
+"""Check of the unit of speed in stage 2, on a minimal shaft: no bus, no guard, no computer clock."""
 
 import math
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ PERIOD_S, RESOLUTION_RAD_S, MEAN_RAD_S, RATE_RAD_S2 = 0.02, 0.001, 2.0, 0.2
 
 
 class Shaft:
-    """It turns ``unit`` times as fast as its drive reports. ``reading(shaft)`` may replace a reading, or be None."""
+    """Shaft that turns ``unit`` times as fast as reported. ``reading(shaft)`` may replace a reading or be None."""
 
     def __init__(self, unit=1.0, reading=None, counts=4096, follows=True):
         self.unit, self.reading, self.follows = unit, reading, follows
@@ -48,7 +48,7 @@ class WithoutAngle:
 
 
 class Loop:
-    """What the check uses of `ControlLoop`."""
+    """The part of `ControlLoop` that the check uses."""
 
     def __init__(self, drive):
         self.drive, self.log, self.period_s = drive, FakeLog(), PERIOD_S
@@ -73,7 +73,7 @@ class Loop:
 
 
 class Checked:
-    """Stage 2 up to the end of its operating point."""
+    """The check during stage 2, up to the end of its operating point."""
 
     def __init__(self, shaft, *, has_angle=True, answer=None, mean_rad_s=MEAN_RAD_S, **witness):
         self.shaft, self.said, self.asked, self.refused = shaft, [], [], None
@@ -123,12 +123,12 @@ def test_a_right_unit_is_seen_on_the_way_and_at_the_mean_speed():
     assert checked.ramped == RAMP_CYCLES                         # without a pause
     assert checked.unit["seen_by"] == "position" and checked.unit["where"] == "6064h"
     assert checked.unit["ratio"] == pytest.approx(1.0, abs=0.01)
-    assert checked.loop.compared == [checked.unit["ratio"]]      # the observer takes it from there
+    assert checked.loop.compared == [checked.unit["ratio"]]      # the observer continues with this angle
     assert any("times the integral of the reported speed" in text for _, text in checked.loop.log.events)
     assert speed_warnings(checked.loop.log.run) == ()
 
 
-def test_so_it_is_backwards_and_at_a_mean_speed_below_the_slow_one():
+def test_a_right_unit_is_seen_backwards_and_at_a_mean_speed_below_the_slow_one():
     assert Checked(Shaft(), mean_rad_s=-MEAN_RAD_S).unit["ratio"] == pytest.approx(1.0, abs=0.01)
     slowly = Checked(Shaft(), mean_rad_s=0.2)
     assert slowly.unit["seen_by"] == "position"
@@ -137,14 +137,14 @@ def test_so_it_is_backwards_and_at_a_mean_speed_below_the_slow_one():
 
 @pytest.mark.parametrize("counts", [60, 12])
 def test_a_coarse_angle_is_compared_at_the_slow_speed(counts):
-    """Its steps are too large for a speed: the ramp waits."""
+    """The resolution of the angle is too coarse for a speed, so the ramp waits."""
     checked = Checked(Shaft(counts=counts))
     assert checked.ramped > RAMP_CYCLES + 100
     assert checked.unit["ratio"] == pytest.approx(1.0, abs=0.05)
 
 
 class Slowing(Shaft):
-    """A shaft that the sign probe left faster than the slow speed. Its report lags by 0.4 s."""
+    """Shaft that is faster than the slow speed after the sign probe. Its report lags by 0.4 s."""
 
     reported_rad_s = 0.0
 
@@ -162,7 +162,7 @@ def test_no_lag_counts_as_travel_while_the_shaft_still_slows_down():
 
 
 @pytest.mark.parametrize(("unit", "said"), [(1.015, False), (0.985, False), (1.05, True), (0.95, True)])
-def test_a_small_difference_is_said_from_two_percent_on(unit, said):
+def test_a_small_difference_is_reported_from_two_percent_on(unit, said):
     checked = Checked(Shaft(unit))
     assert checked.refused is None and checked.unit["ratio"] == pytest.approx(unit, abs=0.01)
     assert [f"{100.0 * (unit - 1.0):+.0f}"[:2] in text for text in checked.said] == [True] * said
@@ -187,7 +187,7 @@ def test_the_ramp_waits_where_the_angle_is_twice_as_fast_as_commanded_and_beyond
 
 
 def test_a_shaft_near_the_highest_speed_is_refused_without_a_comparison():
-    """Its unit jumps on the ramp: 0.7 of the highest speed by the angle is the end, whatever is known by then."""
+    """The unit changes on the ramp. The run ends at 0.7 of the highest speed by the angle, without a comparison."""
     class Jumping(Shaft):
         def exchange(self, command):
             self.unit = 1.0 if abs(command.speed_rad_s) < 1.5 else 4.9
@@ -210,10 +210,10 @@ def test_a_shaft_that_gets_too_fast_on_the_ramp_waits_there_and_is_compared():
     assert checked.loop.speeds.count(checked.loop.speeds[-1]) > 2.0 / PERIOD_S
 
 
-# -- accepted by name -------------------------------------------------------------------------------------------------
+# -- accepted by override --------------------------------------------------------------------------------------------
 
 
-def test_a_wrong_unit_is_taken_by_name_where_the_second_mean_speed_is_not_too_fast():
+def test_a_wrong_unit_is_accepted_by_override_if_the_second_mean_speed_is_not_too_fast():
     checked = Checked(Shaft(0.5), accepted=True)
     assert checked.refused is None and checked.unit["seen_by"] == "--accept-speed-unit"
     assert checked.unit["ratio"] == pytest.approx(0.5, abs=0.01)
@@ -225,27 +225,27 @@ def test_a_wrong_unit_is_taken_by_name_where_the_second_mean_speed_is_not_too_fa
     assert Checked(Shaft(1.3), accepted=True).refused is None
 
 
-# -- without an angle, or with one that shows nothing -----------------------------------------------------------------
+# -- without an angle, or with a constant one ---------------------------------------------------------------------
 
 
-def test_without_an_angle_the_operator_sees_it():
+def test_without_an_angle_the_operator_confirms_the_speed():
     checked = Checked(Shaft(), has_angle=False, answer=True)
     assert checked.refused is None and checked.unit == {"seen_by": "operator", "ratio": None, "where": ""}
     (speed, why), = checked.asked
     assert speed == pytest.approx(slow_speed(LIMITS, RESOLUTION_RAD_S)) and "reports no position" in why
-    assert checked.ramped > RAMP_CYCLES + 3.0 / PERIOD_S         # seen for three seconds before the question
+    assert checked.ramped > RAMP_CYCLES + 3.0 / PERIOD_S         # the shaft turns for three seconds before the question
     assert sum("operator" in text for _, text in checked.loop.log.events) == 2
     assert "was not seen" in str(Checked(Shaft(), has_angle=False, answer=False).refused)
 
 
-def test_a_shaft_that_does_not_turn_at_the_slow_speed_is_not_asked_about():
+def test_there_is_no_question_if_the_shaft_does_not_turn_at_the_slow_speed():
     assert_refused(Checked(Shaft(follows=False), has_angle=False, answer=True), "does not follow a speed of 0.524")
 
 
 @pytest.mark.parametrize(("witness", "by", "words"), [
     ({"simulated": True}, "nobody", "not checked"), ({"accepted": True}, "--accept-speed-unit", "accepted by"),
 ])
-def test_without_an_angle_a_simulated_or_accepted_one_goes_on_with_a_note(witness, by, words):
+def test_without_an_angle_a_simulated_or_accepted_drive_continues_with_a_note(witness, by, words):
     checked = Checked(Shaft(), has_angle=False, **witness)
     assert checked.refused is None and checked.ramped == RAMP_CYCLES and not checked.asked
     assert checked.unit == {"seen_by": by, "ratio": None, "where": ""}
@@ -257,7 +257,7 @@ def frozen(shaft):
     return shaft.counted(position_rad=1.0)
 
 
-def test_an_angle_that_stands_still_is_put_to_the_operator_or_refused():
+def test_with_a_constant_angle_the_operator_is_asked_or_the_run_is_refused():
     checked = Checked(Shaft(reading=frozen), answer=True)
     assert checked.unit["seen_by"] == "operator" and "does not move while" in checked.asked[0][1]
     assert_refused(Checked(Shaft(reading=frozen), simulated=True), "does not move while")
@@ -274,11 +274,11 @@ def test_an_angle_is_lost_after_five_readings_without_an_answer(missing, lost):
     assert SILENT == 5
     if lost:
         assert "no longer reports the position" in checked.asked[0][1]
-        assert checked.shaft.readings == 20 + missing            # it is asked for no more of them
+        assert checked.shaft.readings == 20 + missing            # no more readings are requested
 
 
 def test_a_reading_of_uncertain_time_is_left_out():
-    """The host was late: the angle has turned on meanwhile, by an unknown travel."""
+    """The host was late: the shaft has turned by an unknown angle in the meantime."""
     def reading(shaft):
         if shaft.readings % 7:
             return shaft.counted()
@@ -289,7 +289,7 @@ def test_a_reading_of_uncertain_time_is_left_out():
     assert checked.unit["ratio"] == pytest.approx(1.0, abs=0.01) and checked.ramped == RAMP_CYCLES
 
 
-def test_a_line_whose_readings_are_always_uncertain_is_used_all_the_same():
+def test_a_line_whose_readings_are_always_uncertain_is_used():
     checked = Checked(Shaft(reading=lambda shaft: shaft.counted(half_width_s=0.03)))
     assert checked.unit["seen_by"] == "position"
 

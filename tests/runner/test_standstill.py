@@ -1,4 +1,4 @@
-"""Each condition of standstill by itself: all others hold."""
+"""Each condition of standstill alone, while all others hold."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ AT_REST, SETTLE_S, GAP_S, PERIOD_S = 0.05, 1.5, 0.2, 0.02
 
 @dataclass
 class Observed:
-    """State of the observer, set by a test."""
+    """State of the observer that a test sets."""
 
     reports_trusted: bool = True
     position_quiet: bool = True
@@ -46,7 +46,7 @@ def sample(time_s, speed=0.0, state=PowerState.QUICK_STOP, standstill=True):
 
 
 def rested_after(observed, seconds=20.0, **report):
-    """How long it takes until standstill is seen, s; None within ``seconds``."""
+    """Return the time until standstill is found, s, or None if it is not found within ``seconds``."""
     rest = Standstill(observed, AT_REST, SETTLE_S, GAP_S)
     for cycle in range(1, round(seconds / PERIOD_S)):
         if rest.see(sample(cycle * PERIOD_S, **report)):
@@ -75,22 +75,22 @@ def test_a_report_that_shows_none(report):
 @pytest.mark.parametrize("observed", [
     Observed(reports_trusted=False), Observed(position_quiet=False), Observed(by_position=1.0),
 ])
-def test_an_observer_that_shows_none(observed):
+def test_an_observer_that_shows_no_standstill(observed):
     assert rested_after(observed) is None
 
 
-def test_a_position_that_stands_in_for_a_speed_in_doubt():
+def test_a_position_that_replaces_a_speed_in_doubt():
     assert rested_after(Observed(by_position=0.0), speed=4.0) is not None
 
 
 @pytest.mark.parametrize("observed", [
     Observed(blind_s=4.0), Observed(unseen_s=4.0), Observed(blind_s=3.0, unseen_s=4.0),
 ])
-def test_it_lasts_as_long_as_the_observer_asks_for(observed):
+def test_the_watch_lasts_as_long_as_the_observer_requires(observed):
     assert rested_after(observed) == pytest.approx(4.0, abs=2.0 * PERIOD_S)
 
 
-def test_an_observer_that_asks_for_less_shortens_nothing():
+def test_an_observer_that_requires_less_does_not_shorten_the_watch():
     assert rested_after(Observed(blind_s=0.1, unseen_s=0.1)) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
 
 
@@ -99,7 +99,7 @@ def test_a_shaft_that_may_still_coast_is_not_at_standstill():
 
 
 def at_seconds(seconds, *reports):
-    """Standstill over so long, with other samples in between: `(time, sample)`; when it is seen."""
+    """Return the time at which standstill is found; `(time, sample)`: other samples in between."""
     rest, others = Standstill(Observed(), AT_REST, SETTLE_S, GAP_S), dict(reports)
     for cycle in range(1, round(seconds / PERIOD_S)):
         one = others.get(cycle, sample(cycle * PERIOD_S))
@@ -108,12 +108,12 @@ def at_seconds(seconds, *reports):
     return None
 
 
-def test_one_sample_that_turns_begins_anew():
+def test_one_sample_in_motion_restarts_the_time():
     assert at_seconds(4.0, (50, sample(1.0, speed=0.2))) == pytest.approx(1.0 + SETTLE_S, abs=3.0 * PERIOD_S)
 
 
 def rests_with(every, factor, observed=None):
-    """Whether standstill is seen within 10 s, when each sample of this number shows this multiple of its speed."""
+    """Return whether standstill is found within 10 s if every ``every``-th sample shows a multiple of its speed."""
     rest = Standstill(observed or Observed(), AT_REST, SETTLE_S, GAP_S)
     return any(rest.see(sample(cycle * PERIOD_S, speed=factor * AT_REST * (cycle % every == 0)))
                for cycle in range(1, 500))
@@ -121,7 +121,7 @@ def rests_with(every, factor, observed=None):
 
 @pytest.mark.parametrize(("every", "factor", "rests"), [
     (20, 1.05, True), (20, -1.9, True), (11, 1.05, True),
-    (20, 2.1, False),                  # too fast for a count of noise
+    (20, 2.1, False),                  # too large for a count of noise
     (9, 1.05, False), (2, 1.05, False), (1, 1.05, False),      # too often
 ])
 def test_single_counts_of_noise_do_not_hide_standstill(every, factor, rests):
@@ -129,7 +129,7 @@ def test_single_counts_of_noise_do_not_hide_standstill(every, factor, rests):
 
 
 @pytest.mark.parametrize(("every", "rests"), [(20, True), (9, False)])
-def test_a_position_that_stands_shows_that_a_larger_count_is_noise(every, rests):
+def test_a_constant_position_shows_that_a_larger_count_is_noise(every, rests):
     assert rests_with(every, 3.0, Observed(position_stands=True)) is rests
 
 
@@ -146,7 +146,7 @@ def test_a_count_of_noise_itself_is_no_standstill():
     assert seen_s == pytest.approx((last + 1) * PERIOD_S)
 
 
-def test_a_quiet_sample_needs_no_explanation_after_a_contradiction_or_many_counts():
+def test_a_sample_at_standstill_counts_after_a_contradiction_or_many_counts():
     for observed, counts in ((Observed(doubt="speed"), 0), (Observed(), 50)):
         noise = CountsOfNoise(observed, AT_REST)
         for _ in range(counts):
@@ -155,23 +155,23 @@ def test_a_quiet_sample_needs_no_explanation_after_a_contradiction_or_many_count
         assert not noise.explains(1.05 * AT_REST, quiet=False)
 
 
-def test_a_single_lost_frame_does_not():
+def test_a_single_lost_frame_does_not_hide_standstill():
     assert at_seconds(4.0, (50, None)) == pytest.approx(SETTLE_S, abs=3.0 * PERIOD_S)
 
 
-def test_a_longer_gap_shows_nothing():
+def test_a_longer_gap_shows_no_standstill():
     lost = [(cycle, None) for cycle in range(50, 65)]
     assert at_seconds(4.0, *lost) == pytest.approx(65 * PERIOD_S + SETTLE_S, abs=3.0 * PERIOD_S)
 
 
-def test_a_state_that_shows_none_at_the_end_waits_for_one_that_does():
-    """The time at rest counts; the state must show it in the sample that ends it."""
+def test_a_last_sample_without_standstill_state_extends_the_wait():
+    """The time at standstill counts. The state must show standstill in the last sample."""
     shown = {"state": PowerState.UNKNOWN, "standstill": False}
     unknown = [(cycle, sample(cycle * PERIOD_S, **shown)) for cycle in range(60, 100)]
     assert at_seconds(4.0, *unknown) == pytest.approx(100 * PERIOD_S, abs=2.0 * PERIOD_S)
 
 
-def test_doubt_that_comes_while_it_rests_undoes_it():
+def test_a_doubt_at_standstill_cancels_it():
     observed = Observed()
     rest = Standstill(observed, AT_REST, SETTLE_S, GAP_S)
     for cycle in range(1, 60):

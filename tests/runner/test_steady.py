@@ -1,4 +1,4 @@
-"""When a speed counts as steady, and what is read off it."""
+"""Conditions of a steady speed, and the operating point from it."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def test_a_trace_holds_the_fresh_samples_only():
     assert found.torque_nm.tolist() == [10.0, 30.0]
 
 
-def test_nothing_gives_an_empty_trace():
+def test_no_samples_give_an_empty_trace():
     assert trace([]).time_s.shape == (0,)
 
 
@@ -38,7 +38,7 @@ def test_four_good_blocks_in_a_row_count_as_steady(world):
     assert len(seen) * here.bench.period_s == pytest.approx(4 * 0.5)
 
 
-def test_a_bad_block_begins_the_count_anew(world):
+def test_a_bad_block_restarts_the_count(world):
     here = world()
     here.turn(4.0)
     first = here.drive.cycles
@@ -68,7 +68,7 @@ def test_lost_feedback_ends_the_wait(world):
 
 
 def test_a_loop_with_little_integral_gain_is_named_with_its_time_constant(world):
-    """P 300, I 2: friction leaves a standing error, and the loop would creep at the end of a run just as long."""
+    """P 300, I 2: friction leaves an error that decays slowly. The approach at the end of a run would take as long."""
     here = world(FakeDrive(follow_s=1e9))
     here.turn(4.0)
     first = here.drive.cycles
@@ -82,7 +82,7 @@ def test_a_loop_with_little_integral_gain_is_named_with_its_time_constant(world)
 
 @pytest.mark.parametrize("course", [
     np.full(120, 2.7), 2.7 - 0.001 * np.arange(120), 0.02 * np.arange(120), 3.0 + 0.2 * (-1.0) ** np.arange(120)])
-def test_a_speed_that_stays_away_from_its_setpoint_is_no_slow_approach(course):
+def test_a_speed_with_a_constant_error_is_no_slow_approach(course):
     assert approaching_s(course, 3.0) is None
 
 

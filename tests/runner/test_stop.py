@@ -1,4 +1,4 @@
-"""The stop sequence: its order, and that a turning shaft is never disabled."""
+"""Stop sequence: its order. It never disables a turning shaft."""
 
 import random
 from dataclasses import replace
@@ -33,7 +33,7 @@ def test_quick_stop_then_standstill_then_disable_then_confirmed(world, mode):
 
 @MODES
 def test_the_reported_speed_must_be_zero_for_longer_than_the_largest_lag(world, mode):
-    """Status word and reported speed say standstill from the first cycle on: the shaft may still turn."""
+    """Statusword and reported speed show standstill from the first cycle on, but the shaft may still turn."""
     here = world(FakeDrive(misbehave=lambda drive, sample: sample._replace(speed_rad_s=0.0, standstill=True)))
     here.turn(2.0, mode)
     start_s = here.bench.now_s
@@ -55,7 +55,7 @@ def test_a_lower_highest_speed_of_one_run_makes_no_report_quieter(world, rig_rad
 
 
 @pytest.mark.parametrize("what", ["status", "speed"])
-def test_one_witness_of_standstill_is_not_enough(world, what):
+def test_one_signal_of_standstill_is_not_enough(world, what):
     change = {"standstill": False} if what == "status" else {"speed_rad_s": 0.3}
     here = world(FakeDrive(misbehave=lambda drive, sample: sample._replace(**change)))
     here.turn(5.0)
@@ -101,7 +101,7 @@ def test_speed_mode_comes_first_where_a_quick_stop_does_not_brake_in_torque_mode
     assert here.drive.disabled_at == [0.0]
 
 
-def test_a_mode_that_never_comes_does_not_keep_the_quick_stop_from_being_sent(world):
+def test_the_quick_stop_is_sent_even_if_the_mode_is_never_confirmed(world):
     here = world(FakeDrive(quick_stop_in_torque_mode=False, misbehave=lambda drive, s: s._replace(mode=None)))
     here.drive.state = here.drive.wish = PowerState.ENABLED
     here.drive.speed = 3.0
@@ -122,8 +122,8 @@ def test_a_drive_that_never_confirms_that_it_is_disabled(world):
 
 @pytest.mark.parametrize("method", ["quick_stop", "disable"])
 @pytest.mark.parametrize("times", [1, 10])
-def test_a_request_that_the_drive_does_not_take_at_first_is_made_again(world, method, times):
-    """The contract lets every method of a drive raise."""
+def test_a_request_that_the_drive_rejects_at_first_is_repeated(world, method, times):
+    """Every method of a drive may raise, according to the contract."""
     here = world()
     here.turn(5.0)
     plain, left = getattr(here.drive, method), [times]
@@ -142,7 +142,7 @@ def test_a_request_that_the_drive_does_not_take_at_first_is_made_again(world, me
 
 
 @pytest.mark.parametrize("method", ["quick_stop", "disable"])
-def test_a_request_that_is_never_taken_ends_in_a_report_all_the_same(world, method):
+def test_a_request_that_is_always_rejected_still_ends_in_a_report(world, method):
     here = world()
     here.turn(5.0)
 
@@ -168,7 +168,7 @@ def test_a_broken_log_or_display_does_not_stop_the_stop(world, part):
     assert here.bench.stop_side_troubles
 
 
-def test_it_runs_once_and_a_second_call_gives_the_first_report(world):
+def test_it_runs_once_and_a_second_call_returns_the_first_report(world):
     here = world()
     here.turn(5.0)
     sequence = here.stop_sequence()
@@ -194,7 +194,7 @@ def test_a_guard_that_has_tripped_does_not_disturb_it(world):
 
 
 @pytest.mark.parametrize("speed", [0.0, 5.0])
-def test_a_drive_in_fault_is_at_rest_when_its_shaft_is(world, speed):
+def test_a_drive_in_fault_is_at_standstill_when_its_shaft_is(world, speed):
     here = world()
     here.turn(5.0)
     here.bench.hold(Command(Mode.SPEED, speed, 0.0), 5.0)
@@ -206,7 +206,7 @@ def test_a_drive_in_fault_is_at_rest_when_its_shaft_is(world, speed):
     assert here.drive.speed == 0.0
 
 
-def test_a_faulted_drive_whose_shaft_goes_on_turning_is_not_confirmed(world):
+def test_a_faulted_drive_whose_shaft_continues_to_turn_is_not_confirmed(world):
     here = world(FakeDrive(brakes=False, coulomb=0.0, viscous=0.0))
     here.turn(5.0)
     here.drive.fault()
@@ -222,7 +222,7 @@ def test_a_shaft_that_never_moved_is_disabled_after_the_wait(world):
     assert here.drive.state is PowerState.OFF
 
 
-def test_no_state_is_expected_any_more(world):
+def test_the_guard_expects_no_state_after_the_stop(world):
     here = world()
     here.turn(5.0)
     assert here.guard.expected is PowerState.ENABLED
@@ -230,5 +230,5 @@ def test_no_state_is_expected_any_more(world):
     assert here.guard.expected is None
 
 
-def test_without_any_trouble_to_name_it_is_as_loud():
+def test_an_unconfirmed_stop_without_a_trouble_is_reported_as_well():
     assert "no standstill seen" in str(not_confirmed(StopReport(False, None, False)))

@@ -1,4 +1,4 @@
-"""The stop where the drive's reports contradict each other, show no state, or show a shaft that accelerates."""
+"""Stop with reports that contradict each other, show no state, or show a shaft that accelerates."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STRING = replace(LIMITS, load="string", torque_ramp_nm_s=40.0)
 
 
 class Removing(Reporting):
-    """Its torque can be taken away, too."""
+    """Drive whose torque can also be removed."""
 
     def remove_torque(self):
         self.calls.append("remove_torque")
@@ -32,7 +32,7 @@ class Removing(Reporting):
 
 
 def known(world, speed=5.0, limits=LIMITS, kind=Removing, **options):
-    """Turning, with J and friction as stage 2 found them."""
+    """Turn the shaft, with J and friction known from stage 2."""
     here = world(kind(**options), limits)
     here.turn(speed)
     drive = here.drive
@@ -45,7 +45,7 @@ def known(world, speed=5.0, limits=LIMITS, kind=Removing, **options):
 
 
 def doubted(here, speed=5.0):
-    """Turn on until there is a doubt; the guard raises it."""
+    """Turn until the guard raises a doubt."""
     with pytest.raises(Exception, match=r"contradict|lighter|faster"):
         here.bench.hold(Command(Mode.SPEED, speed, 0.0), 5.0)
     assert here.guard.observer.doubt is not None
@@ -59,7 +59,7 @@ def never_disabled(drive):
 
 
 def test_a_speed_that_is_lost_disables_nothing(world):
-    """The shaft does come to standstill, but nothing that tdhil believes shows it."""
+    """The shaft comes to standstill, but no trusted report shows it."""
     here = known(world)
     here.drive.sees = 0.0
     doubted(here)
@@ -77,8 +77,8 @@ def test_with_a_position_that_lives_standstill_is_confirmed(world):
     assert report.confirmed and here.drive.disabled_at == [0.0]
 
 
-def test_with_a_position_that_goes_on_it_is_not(world):
-    """Zero is reported; the shaft, by its position, turns on."""
+def test_with_a_position_that_moves_standstill_is_not_confirmed(world):
+    """The reported speed is zero, but the position shows motion."""
     here = known(world, with_position=True)
     here.drive.sees = 0.0
     doubted(here)
@@ -163,7 +163,7 @@ def trips(here, state, **then):
 @pytest.mark.parametrize("state", [PowerState.FAULT, PowerState.OFF])
 @pytest.mark.parametrize("knows", [True, False])
 def test_a_drive_that_trips_and_shows_zero_at_once_confirms_nothing(world, state, knows):
-    """Its sensor failed with it, or it reports no speed without torque. The shaft coasts."""
+    """The sensor failed together with the drive, or the drive reports no speed without torque. The shaft coasts."""
     lost, alive = (known(world) if knows else world(Removing(), LIMITS) for _ in range(2))
     if not knows:
         lost.turn(5.0)
@@ -174,7 +174,7 @@ def test_a_drive_that_trips_and_shows_zero_at_once_confirms_nothing(world, state
 
 
 def test_a_drive_that_stays_in_its_fault_reaction_is_not_disabled(world):
-    """Its power stage is on, and may hold torque at standstill: 000Fh is not 0008h."""
+    """The power stage is on and may hold torque at standstill: 000Fh is not 0008h."""
     report = trips(known(world), PowerState.FAULT_REACTION)
     assert not report.confirmed and not report.disabled
 
@@ -213,7 +213,7 @@ def test_the_standstill_speed_of_a_fast_motor_is_no_motion(world):
 
 @pytest.mark.parametrize("with_position", [False, True])
 def test_a_drive_that_shows_no_state_gets_its_quick_stop_again_and_again(world, with_position):
-    """All feedback is zero. A position that jumps to zero is no motion."""
+    """All feedback is zero. A jump of the position to zero is no motion."""
     here = known(world, with_position=with_position)
     here.drive.no_state = True
     here.drive.calls.clear()
@@ -224,7 +224,7 @@ def test_a_drive_that_shows_no_state_gets_its_quick_stop_again_and_again(world, 
     assert here.drive.calls.count("quick_stop") >= 0.5 * (here.bench.now_s - begun_s)
 
 
-def test_a_state_that_comes_back_is_enough(world):
+def test_a_state_that_returns_is_enough(world):
     here = known(world)
     here.drive.no_state = True
     cycles = here.drive.cycles
@@ -250,7 +250,7 @@ def test_a_poll_that_contradicts_the_cycle_prevents_disabling(world):
     assert any("a single request 2.000 rad/s" in line for line in report.trouble)
 
 
-def test_a_poll_that_agrees_is_asked_before_disabling(world):
+def test_a_poll_precedes_disabling(world):
     here = known(world)
     report = here.stop_sequence().run()
     assert report.confirmed and here.drive.polls >= 1
@@ -279,7 +279,7 @@ def test_a_drive_that_only_knows_disable_is_disabled(world):
 
 @pytest.mark.parametrize("more", ["position", "demand"])
 def test_a_torque_report_that_lies_is_no_runaway(world, more):
-    """300 N·m too much in the stop, and a shaft that gets slower: position or demand shows which report is wrong."""
+    """The torque report is 300 N·m too high in the stop, and the shaft slows down. Position or demand show it."""
     here = known(world, with_position=more == "position")
 
     def too_much(drive, one):
@@ -294,7 +294,7 @@ def test_a_torque_report_that_lies_is_no_runaway(world, more):
 
 
 def test_above_a_string_the_torque_stays_on_below_the_limit(world):
-    """It turns at a third of its limit and is pushed on, but no faster: the string must not be let go."""
+    """The shaft turns at a third of its limit and is driven, but no faster. The string must not be released."""
     here = known(world, speed=3.0, limits=STRING, with_position=True)
     here.drive.pushes_nm = here.drive.coulomb + 6.0 * here.drive.viscous       # up to 6 rad/s of 10
     report = here.stop_sequence().run()
@@ -315,35 +315,35 @@ def test_above_a_string_it_is_removed_beyond_the_limit(world):
     assert here.drive.disabled_at[0] > STRING.speed_max_rad_s
 
 
-# -- a motion that was never seen ----------------------------------------
+# -- a motion without a report -------------------------------------------
 
 
 def test_a_sign_probe_that_saw_no_motion_waits_until_the_shaft_has_run_out(world):
-    """The encoder is dead, so the probe's torque has turned the shaft, and only friction stops it."""
+    """The encoder is dead: the torque of the probe has turned the shaft, and only friction stops it."""
     here = world(Reporting(sees=0.0, brakes=False, viscous=4.0))
     here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
     with pytest.raises(PreflightRefused, match="did not move"):
         probe_sign(here.bench, LIMITS, Mode.TORQUE, SPEED_RESOLUTION)
     assert here.drive.speed > 1.0 and not here.guard.observer.moved
     wait_s, begun_s = here.guard.observer.unseen_s, here.bench.now_s
-    here.drive.pushes_nm = 0.0             # a quick stop that sees zero brakes nothing
+    here.drive.pushes_nm = 0.0             # a quick stop with a speed report of zero does not brake
     report = here.stop_sequence().run()
     assert wait_s > 3.0 and here.bench.now_s - begun_s >= wait_s
     assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at), report
 
 
-def test_a_release_whose_speed_follows_is_not():
+def test_a_release_whose_speed_follows_is_not_doubted():
     here = StringWorld(replace(STRING, quick_stop_rad_s2=2.0), twist_nm=300.0, stiffness=30.0)
     report = here.stop_sequence().run()
     assert report.confirmed and here.guard.observer.doubt is None
 
 
-# -- a shaft that runs out ----------------------------------------
+# -- a shaft that coasts -------------------------------------------
 
 
 @pytest.mark.heavy
 def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
-    """It would push the shaft on; so would the watchdog. Zero torque until friction has stopped it, then off."""
+    """Speed control or the watchdog would drive the shaft. The torque is zero until friction stops it; then disable."""
     here = known(world, limits=STRING)
     here.drive.sees = 0.0
     doubted(here)
@@ -353,7 +353,7 @@ def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
     assert "quick_stop" not in here.drive.calls and here.drive.calls.count("remove_torque") == 1
     assert {one.mode for one in here.drive.commands[begun:]} == {Mode.TORQUE}
     assert here.drive.commands[-1].torque_nm == 0.0
-    assert abs(here.drive.disabled_at[0]) < 0.05, "friction had the time to stop it"
+    assert abs(here.drive.disabled_at[0]) < 0.05, "friction has enough time to stop it"
     assert any("standstill was not seen" in line for line in report.trouble)
 
 
@@ -416,7 +416,7 @@ def test_above_a_string_a_probe_that_saw_no_motion_gets_no_speed_control(world):
 
 
 def test_a_lag_of_half_the_kept_time_is_no_error_of_the_observer():
-    """The response to every command that is kept may still be missing."""
+    """The response to every kept command may still be missing."""
     observer = Observer(STRING, 0.02, SPEED_RESOLUTION, assumptions=ControlAssumptions(largest_speed_lag_s=2.0))
     observer.know(RigGuess(104.0, 8.0, 60.0, 0.2))
     observer.begin_stop()
@@ -425,8 +425,8 @@ def test_a_lag_of_half_the_kept_time_is_no_error_of_the_observer():
                      sample(0.0, 300.0, time_s=0.02 * k)._replace(state=PowerState.ENABLED))
 
 
-def test_positions_with_two_zeros_are_not_one_way():
-    """A position that was read in the stop counts from its own zero; then those of the cycle come again."""
+def test_positions_with_two_zeros_are_not_combined():
+    """A position that is read in the stop has its own zero. Then the positions of the cycle return."""
     observer = Observer(LIMITS, 0.02, SPEED_RESOLUTION)
     observer.know(RigGuess(104.0, 8.0, 60.0, 0.2))
     observer.position(1e-3, math.inf)

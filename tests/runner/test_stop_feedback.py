@@ -1,4 +1,4 @@
-"""The stop sequence where feedback fails for a while, for good, or says nothing that is a speed."""
+"""Stop sequence with feedback that fails for a time, fails permanently, or contains no valid speed."""
 
 import pytest
 
@@ -32,7 +32,7 @@ def test_exchanges_that_fail_for_a_while_are_survived(world, first, error):
 @pytest.mark.parametrize(("every", "factor", "confirmed"), [(20, 1.05, True), (20, -1.9, True), (20, 2.5, False),
                                                             (3, 1.05, False)])
 def test_single_counts_of_a_coarse_and_noisy_report_are_no_motion(world, every, factor, confirmed):
-    """Neither before the drive is disabled nor after."""
+    """They count as motion neither before nor after the drive is disabled."""
     here = world()
     here.turn(5.0)
     at_rest_rad_s = AT_REST_SHARE * LIMITS.speed_max_rad_s
@@ -47,7 +47,7 @@ def test_single_counts_of_a_coarse_and_noisy_report_are_no_motion(world, every, 
 
 
 @pytest.mark.parametrize("misbehave", [lost, lambda drive, sample: sample._replace(fresh=False)], ids=["dead", "stale"])
-def test_a_drive_that_can_not_be_reached_is_given_up_and_left_to_its_watchdog(world, misbehave):
+def test_an_unreachable_drive_is_left_to_its_watchdog(world, misbehave):
     here = world()
     here.turn(5.0)
     begun = here.drive.cycles
@@ -61,7 +61,7 @@ def test_a_drive_that_can_not_be_reached_is_given_up_and_left_to_its_watchdog(wo
 
 
 @pytest.mark.parametrize(("missing_s", "anew"), [(0.5 * LONGEST_GAP_S, False), (1.5 * LONGEST_GAP_S, True)])
-def test_a_longer_gap_in_the_feedback_begins_the_wait_anew(world, missing_s, anew):
+def test_a_longer_gap_in_the_feedback_restarts_the_wait(world, missing_s, anew):
     here = world()
     here.turn(5.0)
     begun, missing = here.drive.cycles, round(missing_s / PERIOD_S)
@@ -79,7 +79,7 @@ def test_a_longer_gap_in_the_feedback_begins_the_wait_anew(world, missing_s, ane
 
 @pytest.mark.parametrize(("missing", "confirmed"), [(LONGEST_GAP_CYCLES - 1, True), (LONGEST_GAP_CYCLES, False)])
 def test_on_a_slow_line_the_gap_is_counted_in_cycles(world, missing, confirmed):
-    """At 10 Hz, again and again: some frames are lost for each that comes."""
+    """Several frames are lost for each one that arrives, at 10 Hz."""
     here = world(FakeDrive(period_s=0.1))
     here.turn(1.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=drive.cycles % (missing + 1) == 0)
@@ -94,7 +94,7 @@ def test_speed_feedback_that_is_no_number_is_no_standstill(world):
     assert "disable" not in here.drive.calls
 
 
-def test_silence_is_told(world):
+def test_missing_feedback_is_reported(world):
     here = world()
     here.turn(5.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=False)
@@ -102,7 +102,7 @@ def test_silence_is_told(world):
 
 
 class Asked(FakeDrive):
-    """Reports its angle to a single request only; ``error``: what such a request raises."""
+    """Drive that reports its angle to a single request only. ``error``: exception of such a request."""
 
     turned_rad = 0.0
     readings = 0
@@ -120,7 +120,7 @@ class Asked(FakeDrive):
 
 
 @pytest.mark.parametrize("error", [None, CommunicationLost("no reply"), KeyboardInterrupt()])
-def test_a_position_by_single_requests_is_asked_for_at_intervals(world, error):
+def test_a_position_by_single_requests_is_polled_at_intervals(world, error):
     here = world(Asked())
     here.turn(5.0)
     here.drive.error, begun_s = error, here.bench.now_s
@@ -131,7 +131,7 @@ def test_a_position_by_single_requests_is_asked_for_at_intervals(world, error):
 
 
 class Creeping(Asked):
-    """Creeps on for a while at a speed that a coarse report shows as zero."""
+    """Drive whose shaft creeps for a while at a speed that a coarse report shows as zero."""
 
     longest_s = 6.0
     crept_s = 0.0
@@ -144,7 +144,7 @@ class Creeping(Asked):
 
 
 def test_standstill_is_held_against_a_position_by_single_requests(world):
-    """The stop's own readings are no reason to read less often (`benchmarks/lying_reports.py`, number 3730)."""
+    """The readings of the stop must not reduce the polling rate (`benchmarks/lying_reports.py`, number 3730)."""
     here = world(Creeping())
     here.turn(5.0)
     assert here.stop_sequence().run().confirmed

@@ -1,4 +1,4 @@
-"""A stop in which things come and go: speed, feedback, torque, the drive's state."""
+"""Stop with intermittent conditions: speed, feedback, torque, and the state of the drive."""
 
 from dataclasses import dataclass
 
@@ -14,15 +14,15 @@ SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
 
 
 def cycle_feedback(drive, sample):
-    """As the drive's ``gone`` says; what comes may tell of another torque or speed."""
+    """Drop the feedback according to the drive's ``gone``. The rest may contain another torque or speed."""
     if drive.gone(drive.cycles):
         return sample._replace(fresh=False)
     return sample._replace(**drive.told)
 
 
 @dataclass
-class Seen(FakeDrive):
-    """Can be looked at, and a look tells the truth."""
+class Polled(FakeDrive):
+    """Drive that answers polls, and answers them truthfully."""
 
     def __post_init__(self):
         self.misbehave, self.gone, self.told = cycle_feedback, lambda cycle: False, {}
@@ -32,8 +32,8 @@ class Seen(FakeDrive):
 
 
 @dataclass
-class SeenString(StringDrive):
-    """The same with a string on it."""
+class PolledString(StringDrive):
+    """The same drive with a string."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -43,11 +43,11 @@ class SeenString(StringDrive):
         return self.report()
 
 
-def test_a_shaft_that_turns_once_more_is_waited_for_anew(world):
+def test_a_shaft_that_turns_again_restarts_the_wait(world):
     here = world()
     here.turn(2.0)
     begun = here.drive.cycles
-    again = range(begun + 120, begun + 125)            # at rest for more than a second by then
+    again = range(begun + 120, begun + 125)            # at standstill for more than a second by then
 
     def turns(drive, sample):
         return sample._replace(speed_rad_s=0.5, standstill=False) if drive.cycles in again else sample
@@ -59,9 +59,9 @@ def test_a_shaft_that_turns_once_more_is_waited_for_anew(world):
     assert report.at_rest_s - begin_s >= 125 * PERIOD_S + SETTLE_S - 0.05
 
 
-def test_feedback_that_comes_back_gives_the_shaft_time_anew(world):
-    """Gone twice for less than looks wait for a shaft that gets no slower."""
-    here = world(Seen(brakes=False))
+def test_feedback_that_returns_restarts_the_time_of_the_shaft(world):
+    """Feedback is missing twice, each time for less than polls wait for a shaft that does not slow down."""
+    here = world(Polled(brakes=False))
     here.turn(5.0)
     here.drive.coulomb = here.drive.viscous = 0.0
     begun = here.drive.cycles
@@ -77,9 +77,9 @@ def test_feedback_that_comes_back_gives_the_shaft_time_anew(world):
 @pytest.mark.parametrize("told", [{"torque_nm": 300.0}, {"torque_nm": 300.0, "speed_rad_s": 5.0}],
                          ids=["gone", "not believed"])
 def test_torque_of_feedback_that_is_gone_or_not_believed_is_not_held(told):
-    """A look shows the string at ease: so it may be disabled."""
+    """A poll shows the string without torque, so the drive may be disabled."""
     here = StringWorld()
-    here.drive = here.bench.drive = SeenString()
+    here.drive = here.bench.drive = PolledString()
     here.drive.state = here.drive.wish = PowerState.QUICK_STOP
     here.drive.told = told
     if "speed_rad_s" not in told:
@@ -119,7 +119,7 @@ def test_without_feedback_no_torque_is_released():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=not 150 <= drive.cycles < 160)
     assert here.stop_sequence().run().confirmed
-    assert here.drive.commands[148].speed_rad_s != 0.0, "it yields by then"
+    assert here.drive.commands[148].speed_rad_s != 0.0, "it yields at this time"
     assert [command.speed_rad_s for command in here.drive.commands[150:160]] == [0.0] * 10
     assert here.drive.commands[165].speed_rad_s != 0.0
 
@@ -137,8 +137,8 @@ def test_a_fault_during_the_release_of_torque_ends_it_and_is_reported_once():
     assert sum("during the release of trapped torque" in line for line in report.trouble) == 1
 
 
-def test_quick_stop_comes_as_soon_as_speed_mode_is_there(world):
-    """A drive that stays in torque mode: test_stop_stays_in_torque_mode.py."""
+def test_the_quick_stop_follows_speed_mode_at_once(world):
+    """For a drive that stays in torque mode see test_stop_stays_in_torque_mode.py."""
     here = world(FakeDrive(quick_stop_in_torque_mode=False))
     here.turn(5.0, Mode.TORQUE)
     before = len(here.drive.calls)
@@ -147,13 +147,13 @@ def test_quick_stop_comes_as_soon_as_speed_mode_is_there(world):
 
 
 @pytest.mark.parametrize("gone", ["missing", "frozen"])
-def test_a_look_that_fails_is_told_and_the_stop_goes_on(world, gone):
+def test_a_failed_poll_is_reported_and_the_stop_continues(world, gone):
     @dataclass
-    class Unseen(Seen):
+    class Unanswered(Polled):
         def poll(self):
             raise CommunicationLost("6041h does not answer")
 
-    here = world(Unseen())
+    here = world(Unanswered())
     here.turn(5.0)
     if gone == "missing":
         here.drive.gone = lambda cycle: True

@@ -1,4 +1,4 @@
-"""The stop sequence where something is raised on the way, in a call or between two."""
+"""Stop sequence with exceptions, in a call or between two calls."""
 
 import pytest
 
@@ -28,8 +28,8 @@ def test_an_interrupt_in_any_call_does_not_end_it(world, error, where):
 
 
 @pytest.mark.parametrize("times", [1, MOST_INTERRUPTIONS - 1])
-def test_an_interrupt_between_the_calls_begins_it_anew(world, times):
-    """A second Ctrl-C can strike anywhere, in the sequence's own lines too."""
+def test_an_interrupt_between_the_calls_restarts_it(world, times):
+    """A second Ctrl-C may come anywhere, also between two lines of the sequence."""
     here = world()
     here.turn(5.0)
     sequence = here.stop_sequence()

@@ -1,4 +1,4 @@
-"""How long the stop sequence waits for a shaft to come to rest."""
+"""Time that the stop sequence waits for standstill."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from tests.runner.stop_calls import LAG_S
 
 
 def test_a_heavy_shaft_at_its_torque_limit_is_waited_for(world):
-    """Ten times as long as the ramp: it gets slower all the while."""
+    """It takes ten times as long as the ramp and slows down all the time."""
     here = world(FakeDrive(brakes=False, coulomb=0.0, viscous=0.0))
     here.turn(5.0)
     here.drive.misbehave = lambda drive, sample: setattr(drive, "speed", max(0.0, drive.speed - 0.1 * PERIOD_S)) or (
@@ -19,7 +19,7 @@ def test_a_heavy_shaft_at_its_torque_limit_is_waited_for(world):
     assert report.at_rest_s - start_s == pytest.approx(5.0 / 0.1 + 3.0 * LAG_S, abs=1.0)
 
 
-def test_how_long_it_was_waited_for_is_said(world):
+def test_the_duration_of_the_wait_is_reported(world):
     here = world(FakeDrive(brakes=False))
     here.turn(5.0)
     here.drive.coulomb = here.drive.viscous = 0.0
@@ -41,7 +41,7 @@ def test_cycles_without_feedback_count_as_time(world):
     assert here.bench.now_s - begun_s == pytest.approx(19.0, abs=0.2)
 
 
-def test_a_shaft_that_may_coast_is_waited_for_and_not_for_ever():
+def test_the_wait_for_a_coasting_shaft_is_bounded():
     patience = StopTimeout(5.0, 0.05)
     ended_s = {}
     while len(ended_s) < 2 and patience.waited_s < 2.0 * LONGEST_S:
@@ -49,6 +49,6 @@ def test_a_shaft_that_may_coast_is_waited_for_and_not_for_ever():
         for coasts_s in (0.0, 1.0):
             if patience.ends(coasts_s):
                 ended_s.setdefault(coasts_s, patience.waited_s)
-    # two blocks without a lower speed end the usual wait; feedback that stays away must not make it endless
+    # Two blocks without a lower speed end the usual wait. Permanently missing feedback must not make it endless.
     assert ended_s[0.0] < 20.0
     assert ended_s[1.0] == pytest.approx(LONGEST_S, abs=1.0)

@@ -1,4 +1,4 @@
-"""A stop without the cycle's feedback: single looks tell of rest, and never lead to a turning shaft being let go."""
+"""Stop without cyclic feedback: polls show standstill, and tdhil never disables a turning shaft because of a poll."""
 
 from dataclasses import dataclass, replace
 
@@ -26,9 +26,9 @@ SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
 
 @dataclass
 class LookedAt(FakeDrive):
-    """Can be looked at; ``gone``: what became of the cycle's feedback."""
+    """Drive that answers polls; ``gone``: the fault of the cyclic feedback."""
 
-    looks: int = 0
+    polls: int = 0
     answers: bool = True
     raises: BaseException | None = None
     gone: str = ""
@@ -48,7 +48,7 @@ class LookedAt(FakeDrive):
         return sample
 
     def poll(self):
-        self.looks += 1
+        self.polls += 1
         if self.raises is not None:
             raise self.raises
         return self.report() if self.answers else None
@@ -63,18 +63,18 @@ def stopped(world, gone, speed=5.0, **options):
 
 @pytest.mark.parametrize("gone", ["missing", "error"])
 @pytest.mark.parametrize("speed", [0.0, 5.0])
-def test_without_feedback_looks_confirm_it(world, gone, speed):
+def test_without_feedback_polls_confirm_standstill(world, gone, speed):
     here, report = stopped(world, gone, speed)
     assert report.confirmed and report.disabled
     assert here.drive.disabled_at == [0.0]
     assert any("the drive was polled instead" in line for line in report.trouble)
-    # Ramp, settling, disabling and settling again, and the looks no closer together than said.
+    # Ramp, settling, disabling and settling again. Polls are at least EVERY_S apart.
     took_s = speed / 2.0 + 2.0 * SETTLE_S
-    assert here.drive.looks <= took_s / EVERY_S + 10
+    assert here.drive.polls <= took_s / EVERY_S + 10
 
 
-def test_without_feedback_in_torque_mode_the_quick_stop_comes_and_looks_confirm_it(world):
-    """A profile that does not state that a quick stop brakes in torque mode: nothing shows the mode now."""
+def test_without_feedback_in_torque_mode_polls_confirm_the_quick_stop(world):
+    """The profile does not state that a quick stop brakes in torque mode, and no report shows the mode."""
     here = world(LookedAt(quick_stop_in_torque_mode=False))
     here.turn(3.0, Mode.TORQUE)
     here.drive.gone = "missing"
@@ -82,23 +82,23 @@ def test_without_feedback_in_torque_mode_the_quick_stop_comes_and_looks_confirm_
     asked_s = []
     here.drive.quick_stop = lambda stop=here.drive.quick_stop: (asked_s.append(here.bench.now_s), stop())
     report = here.stop_sequence().run()
-    assert report.confirmed and report.disabled and here.drive.looks > 10
+    assert report.confirmed and report.disabled and here.drive.polls > 10
     assert asked_s[0] - begun_s < MODE_S + 0.1
     assert not report.stayed_in_torque_mode
 
 
 @pytest.mark.parametrize("mode", [Mode.SPEED, Mode.TORQUE])
-def test_without_feedback_above_a_string_looks_confirm_the_quick_stop(mode):
-    class Looked(StringDrive):
+def test_without_feedback_above_a_string_polls_confirm_standstill(mode):
+    class PolledString(StringDrive):
         def poll(self):
-            self.looks = getattr(self, "looks", 0) + 1
+            self.polls = getattr(self, "polls", 0) + 1
             return self.report()
 
     here = StringWorld(speed=3.0, mode=mode)
-    here.drive.__class__ = Looked
+    here.drive.__class__ = PolledString
     here.drive.misbehave = lambda drive, sample: sample._replace(fresh=False)
     report = here.stop_sequence().run()
-    assert here.drive.looks > 10
+    assert here.drive.polls > 10
     assert report.at_rest_s is not None, report.trouble
 
 
@@ -111,11 +111,11 @@ def test_a_shaft_that_brakes_on_a_slow_ramp_is_not_left_to_the_watchdog(world):
     assert report.confirmed, report.trouble
 
 
-def test_a_poll_that_contradicts_the_cycle_is_repeated_after_a_standstill_and_told_once(world):
+def test_a_poll_that_contradicts_the_cycle_is_repeated_after_a_standstill_and_reported_once(world):
     @dataclass
     class Stuck(LookedAt):
         def poll(self):
-            self.looks += 1
+            self.polls += 1
             return self.report()._replace(speed_rad_s=1.0)
 
     here = world(Stuck())
@@ -123,12 +123,12 @@ def test_a_poll_that_contradicts_the_cycle_is_repeated_after_a_standstill_and_to
     begun_s = here.bench.now_s
     report = here.stop_sequence().run()
     assert not report.confirmed
-    assert here.drive.looks <= (here.bench.now_s - begun_s) / SETTLE_S + 2
+    assert here.drive.polls <= (here.bench.now_s - begun_s) / SETTLE_S + 2
     assert sum("a single request" in line for line in report.trouble) == 1
 
 
-def test_a_polled_speed_of_zero_that_the_angle_contradicts_is_no_rest(world):
-    """The shaft brakes to 0.5 rad/s and goes on; the reported speed is 0.5 rad/s too low all the time."""
+def test_a_polled_speed_of_zero_that_the_angle_contradicts_is_no_standstill(world):
+    """The shaft brakes to 0.5 rad/s and continues to turn. The reported speed is always 0.5 rad/s too low."""
 
     class Low(LookedAt):
         turned_rad = 0.0
@@ -149,12 +149,12 @@ def test_a_polled_speed_of_zero_that_the_angle_contradicts_is_no_rest(world):
     assert not report.confirmed and all(speed == 0.0 for speed in here.drive.disabled_at)
 
 
-def test_polls_of_which_two_in_three_bring_nothing_confirm_it(world):
-    """A computer that is late: the drive has tripped its watchdog, sends no frame, and answers now and then."""
+def test_polls_of_which_one_in_three_is_answered_confirm_standstill(world):
+    """The host was late and the watchdog has tripped. The drive sends no frames and answers every third poll."""
 
     class Late(LookedAt):
         def poll(self):
-            self.answers = self.looks % 3 == 2
+            self.answers = self.polls % 3 == 2
             return super().poll()
 
     here = world(Late())
@@ -164,11 +164,11 @@ def test_polls_of_which_two_in_three_bring_nothing_confirm_it(world):
     assert report.confirmed and here.drive.disabled_at == [0.0]
 
 
-def test_what_is_heard_of_the_cycle_is_enough(world):
+def test_with_cyclic_feedback_one_poll_is_enough(world):
     here = world(LookedAt(misbehave=None))
     here.turn(5.0)
     assert here.stop_sequence().run().confirmed
-    assert here.drive.looks == 1       # one, before the drive is disabled
+    assert here.drive.polls == 1       # one, before the drive is disabled
 
 
 @pytest.mark.parametrize("options", [
@@ -176,7 +176,7 @@ def test_what_is_heard_of_the_cycle_is_enough(world):
     {"raises": KeyboardInterrupt()},
 ])
 @pytest.mark.parametrize("gone", ["missing", "error"])
-def test_looks_that_bring_nothing_take_no_longer_than_none(world, gone, options):
+def test_unanswered_polls_do_not_delay_the_end_of_the_stop(world, gone, options):
     here = world(LookedAt(**options))
     here.turn(5.0)
     here.drive.gone = gone
@@ -185,10 +185,10 @@ def test_looks_that_bring_nothing_take_no_longer_than_none(world, gone, options)
     assert not report.confirmed and report.at_rest_s is None
     assert "disable" not in here.drive.calls
     assert here.bench.now_s - begun_s <= SILENT_S + 2 * PERIOD_S
-    assert 1 <= here.drive.looks <= 5
+    assert 1 <= here.drive.polls <= 5
 
 
-def test_a_shaft_that_looks_show_turning_is_left_to_the_watchdog_soon(world):
+def test_a_shaft_that_turns_by_its_polls_is_left_to_the_watchdog_soon(world):
     here = world(LookedAt(brakes=False))
     here.turn(5.0)
     here.drive.coulomb = here.drive.viscous = 0.0
@@ -201,12 +201,12 @@ def test_a_shaft_that_looks_show_turning_is_left_to_the_watchdog_soon(world):
     assert here.bench.now_s - begun_s <= AFTER_S + SLOWING_S + 3.0 * EVERY_S
 
 
-def test_without_a_watchdog_that_would_act_the_host_goes_on_asking(world):
-    """The drive takes the quick stop only after a while; nobody else would stop the shaft."""
+def test_without_an_effective_watchdog_the_host_continues_the_quick_stop(world):
+    """The drive takes the quick stop only after some time. No watchdog would stop the shaft."""
 
     class Late(LookedAt):
         def poll(self):
-            self.brakes = self.looks > 20
+            self.brakes = self.polls > 20
             return super().poll()
 
     here = world(Late(brakes=False))
@@ -218,7 +218,7 @@ def test_without_a_watchdog_that_would_act_the_host_goes_on_asking(world):
     assert here.drive.disabled_at == [0.0]
 
 
-def test_one_that_coasts_to_rest_is_waited_for(world):
+def test_a_shaft_that_coasts_to_standstill_is_waited_for(world):
     here = world(LookedAt(brakes=False))
     here.turn(5.0)
     here.drive.gone = "missing"
@@ -227,7 +227,7 @@ def test_one_that_coasts_to_rest_is_waited_for(world):
     assert here.drive.disabled_at == [0.0]
 
 
-def test_frozen_feedback_is_not_believed_against_a_look(world):
+def test_frozen_feedback_that_a_poll_contradicts_is_rejected(world):
     here, report = stopped(world, "frozen")
     assert report.confirmed
     assert here.drive.disabled_at == [0.0]
@@ -235,7 +235,7 @@ def test_frozen_feedback_is_not_believed_against_a_look(world):
 
 
 @pytest.mark.parametrize("options", [{"brakes": False}, {"answers": False}, {"raises": CommunicationLost("gone")}])
-def test_frozen_feedback_that_no_look_contradicts_is_never_rest(world, options):
+def test_frozen_feedback_without_a_contradicting_poll_is_no_standstill(world, options):
     here = world(LookedAt(**options))
     here.turn(5.0)
     here.drive.coulomb = here.drive.viscous = 0.0
@@ -245,8 +245,8 @@ def test_frozen_feedback_that_no_look_contradicts_is_never_rest(world, options):
     assert "disable" not in here.drive.calls
 
 
-def test_feedback_that_goes_after_rest_was_seen(world):
-    """Disabling, and staying at rest, are told by looks alone."""
+def test_feedback_that_is_lost_after_standstill_was_seen(world):
+    """Only polls show that the drive is disabled and that the shaft stays at standstill."""
     here = world(LookedAt())
     here.turn(2.0)
     disable = here.drive.disable
@@ -260,26 +260,26 @@ def test_feedback_that_goes_after_rest_was_seen(world):
     report = here.stop_sequence().run()
     assert report.confirmed
     assert here.bench.now_s - begun_s < 1.0 + SETTLE_S + REST_AFTER_S
-    assert here.drive.looks >= SETTLE_S / EVERY_S - 2
+    assert here.drive.polls >= SETTLE_S / EVERY_S - 2
 
 
 @pytest.mark.parametrize("period_s", [0.004, 0.02, 0.2])
-def test_looks_are_due_by_time(period_s):
+def test_polls_are_due_by_time(period_s):
     drive = LookedAt()
     drive.mode = Mode.SPEED
-    looks = FeedbackPolls(drive, period_s)
+    polls = FeedbackPolls(drive, period_s)
     for _ in range(round(2.0 / period_s)):
-        looks.missed()
-    assert drive.looks <= (2.0 - AFTER_S) / max(EVERY_S, period_s) + 2
-    assert drive.looks >= (2.0 - AFTER_S) / max(EVERY_S, period_s) - 2
-    looks.heard()
-    assert not looks.standing
-    assert looks.missed() is None or period_s >= AFTER_S
+        polls.missed()
+    assert drive.polls <= (2.0 - AFTER_S) / max(EVERY_S, period_s) + 2
+    assert drive.polls >= (2.0 - AFTER_S) / max(EVERY_S, period_s) - 2
+    polls.heard()
+    assert not polls.standing
+    assert polls.missed() is None or period_s >= AFTER_S
 
 
 @dataclass
-class Starved(FakeDrive):
-    """Is driven on by somebody else at ``driven`` rad/s, until its watchdog has heard nothing for a while."""
+class DrivenOn(FakeDrive):
+    """Drive that another master keeps at ``driven`` rad/s, until the watchdog trips after the end of feeding."""
 
     driven: float | None = 5.0
     watchdog_s: float = 0.5
@@ -307,7 +307,7 @@ class Starved(FakeDrive):
 
 @pytest.mark.parametrize("refuses", [0, 3])
 def test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched(world, refuses):
-    here = world(Starved(driven=None, refuses=refuses))
+    here = world(DrivenOn(driven=None, refuses=refuses))
     here.turn(5.0)
     here.drive.driven = 5.0
     begun_s = here.bench.now_s
@@ -319,9 +319,9 @@ def test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched(wor
     assert report.trouble.count("busy") == refuses
 
 
-def test_a_watchdog_that_takes_its_time_is_waited_for(world):
-    """As long again as for a quick stop of the host's."""
-    here = world(Starved(driven=None, watchdog_s=14.0))
+def test_the_stop_waits_for_a_slow_watchdog(world):
+    """The host waits for the watchdog as long as for its own quick stop."""
+    here = world(DrivenOn(driven=None, watchdog_s=14.0))
     here.turn(5.0)
     here.drive.driven = 5.0
     assert here.stop_sequence().run().confirmed
@@ -329,9 +329,9 @@ def test_a_watchdog_that_takes_its_time_is_waited_for(world):
 
 @pytest.mark.parametrize("read_by", ["polls", "nothing until the watchdog acts"])
 def test_the_watch_does_not_end_before_a_slow_watchdog_acts(world, read_by):
-    """A Modbus drive whose watchdog each request feeds is not read meanwhile. The watch ended after 1 s."""
+    """Each request feeds the watchdog of a Modbus drive, so it is not read. The watch used to end after 1 s."""
 
-    class NotReported(Starved):
+    class NotReported(DrivenOn):
         def exchange(self, command):
             sample = super().exchange(command)
             return sample._replace(fresh=False) if self.unfed_since_s is not None and not self.tripped else sample
@@ -352,8 +352,8 @@ def test_the_watch_does_not_end_before_a_slow_watchdog_acts(world, read_by):
     assert report.confirmed, report.trouble
 
 
-def test_a_drive_that_somebody_else_feeds_too_is_asked_once(world):
-    here = world(Starved(driven=None, rejects=True))
+def test_stop_feeding_is_requested_once_if_another_master_feeds_the_watchdog(world):
+    here = world(DrivenOn(driven=None, rejects=True))
     here.turn(5.0)
     here.drive.driven = 5.0
     report = here.stop_sequence().run()
@@ -364,8 +364,8 @@ def test_a_drive_that_somebody_else_feeds_too_is_asked_once(world):
 
 
 @pytest.mark.parametrize("options", [{"watched": False}, {}])
-def test_a_drive_without_a_watchdog_or_one_that_can_not_is_fed_on(world, options):
-    drive = Starved(driven=None) if options else FakeDrive(brakes=False)
+def test_feeding_continues_without_a_watchdog_or_without_stop_feeding(world, options):
+    drive = DrivenOn(driven=None) if options else FakeDrive(brakes=False)
     here = world(drive)
     here.turn(5.0)
     drive.driven, drive.coulomb, drive.viscous = 5.0, 0.0, 0.0
@@ -373,8 +373,8 @@ def test_a_drive_without_a_watchdog_or_one_that_can_not_is_fed_on(world, options
     assert not report.confirmed and "stop_feeding" not in drive.calls
 
 
-def test_a_watchdog_that_does_not_act_either_is_said(world):
-    here = world(Starved(driven=None, watchdog_s=1e9))
+def test_a_watchdog_that_does_not_act_leaves_the_stop_unconfirmed(world):
+    here = world(DrivenOn(driven=None, watchdog_s=1e9))
     here.turn(5.0)
     here.drive.driven = 5.0
     report = here.stop_sequence().run()
@@ -383,18 +383,18 @@ def test_a_watchdog_that_does_not_act_either_is_said(world):
 
 
 @pytest.mark.parametrize("inertia", [100.0, 1500.0])
-def test_a_shaft_that_brakes_as_well_as_it_can_is_fed_to_the_end(world, inertia):
-    """Down the drive's ramp, and a heavy one by its friction alone, for more than a minute."""
-    here = world(Starved(driven=None, inertia=inertia, brakes=inertia < 1000.0))
+def test_the_watchdog_of_a_slowing_shaft_is_fed_to_the_end(world, inertia):
+    """The shaft slows down on the ramp of the drive, or a heavy one by friction alone for more than a minute."""
+    here = world(DrivenOn(driven=None, inertia=inertia, brakes=inertia < 1000.0))
     here.turn(9.0)
     report = here.stop_sequence().run()
     assert report.confirmed and "stop_feeding" not in here.drive.calls
 
 
 @pytest.mark.heavy
-def test_a_swinging_string_or_a_long_ramp_is_no_shaft_that_goes_on_turning(world):
+def test_with_a_string_or_a_long_ramp_the_wait_for_a_slowing_shaft_is_longer(world):
     for limits in (replace(LIMITS, load="string", torque_ramp_nm_s=20.0), replace(LIMITS, quick_stop_rad_s2=0.1)):
-        here = world(Starved(driven=None), limits)
+        here = world(DrivenOn(driven=None), limits)
         here.turn(5.0)
         here.drive.driven = 5.0
         sequence, unfed = here.stop_sequence(), []
@@ -417,8 +417,8 @@ def test_slowing():
     assert not slowing.see(41.0, float("nan"))
 
 
-def test_a_drive_that_can_not_be_looked_at_is_not():
-    looks = FeedbackPolls(FakeDrive(), PERIOD_S)
-    assert looks.ask() is None
-    assert all(looks.missed() is None for _ in range(round(3.0 / PERIOD_S)))
-    assert (looks.answered, looks.standing) == (0, True)
+def test_a_drive_without_polls_is_not_polled():
+    polls = FeedbackPolls(FakeDrive(), PERIOD_S)
+    assert polls.ask() is None
+    assert all(polls.missed() is None for _ in range(round(3.0 / PERIOD_S)))
+    assert (polls.answered, polls.standing) == (0, True)

@@ -1,4 +1,4 @@
-"""Whatever the feedback does during a stop, no turning shaft is disabled, and only one at rest is said to be."""
+"""Stop with any faults of the feedback: no turning shaft is disabled, and standstill is confirmed only if true."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from drivers.errors import CommunicationLost
 from tests.runner.fake_drive import PERIOD_S, FakeDrive, World
 
 AT_REST_RAD_S = 0.2
-"""A shaft below it counts as at rest for the fault injection (`benchmarks/lying_reports.py`), too."""
+"""Speed of standstill, as in the fault injection (`benchmarks/lying_reports.py`)."""
 
 LONGEST_S = 400.0
-"""A stop that has no end of its own would go on for ever."""
+"""Time limit of a stop, which detects a stop without an end."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What becomes of the feedback, for so many cycles."""
+    """One fault of the feedback, and its number of cycles."""
 
     kind: str
     cycles: int
@@ -29,7 +29,7 @@ class Episode:
 
 @dataclass
 class Troubled(FakeDrive):
-    """Its feedback goes through the episodes, one after the other; it answers single requests while ``answers``."""
+    """Drive whose feedback goes through the episodes in order. It answers polls while ``answers``."""
 
     episodes: tuple[Episode, ...] = ()
     answers: bool = True
@@ -72,14 +72,14 @@ any_trouble = given(episodes, st.floats(0.0, 9.0), st.booleans(), st.booleans(),
 
 @settings(max_examples=20)
 @any_trouble
-def test_a_turning_shaft_is_never_disabled_and_rest_is_never_invented(happens, speed, brakes, in_torque_mode, answers):
+def test_no_turning_shaft_is_disabled_and_standstill_is_never_false(happens, speed, brakes, in_torque_mode, answers):
     nothing_is_invented(happens, speed, brakes, in_torque_mode, answers)
 
 
 @pytest.mark.heavy
 @settings(max_examples=60)
 @any_trouble
-def test_in_more_trouble_neither(happens, speed, brakes, in_torque_mode, answers):
+def test_the_same_with_more_faults(happens, speed, brakes, in_torque_mode, answers):
     nothing_is_invented(happens, speed, brakes, in_torque_mode, answers)
 
 
@@ -99,7 +99,7 @@ def nothing_is_invented(happens, speed, brakes, in_torque_mode, answers):
 @settings(max_examples=40)
 @given(episodes, st.floats(0.0, 9.0))
 def test_a_drive_that_brakes_and_answers_is_confirmed_once_its_feedback_is_back(happens, speed):
-    """No episode is longer than what the stop bears: it always ends with a shaft that is seen at rest."""
+    """The stop tolerates each episode, so it always confirms standstill."""
     short = tuple(one for one in happens if one.kind != "frozen")
     here = World(Troubled(episodes=short))
     here.turn(speed)

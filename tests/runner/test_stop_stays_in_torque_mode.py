@@ -1,4 +1,4 @@
-"""The stop of a drive that stays in torque mode, where its quick stop does not brake."""
+"""Stop of a drive that stays in torque mode, where its quick stop does not brake."""
 
 from itertools import pairwise
 
@@ -42,7 +42,7 @@ def test_friction_stops_it_at_zero_torque(world):
     assert "stayed in torque mode" in report.trouble[0]
 
 
-def test_a_drive_that_changes_to_speed_mode_is_not_blamed(world):
+def test_a_drive_that_changes_to_speed_mode_is_no_such_drive(world):
     here = world(FakeDrive(quick_stop_in_torque_mode=False))
     here.turn(5.0, Mode.TORQUE)
     report = here.stop_sequence().run()
@@ -58,8 +58,8 @@ def test_a_quick_stop_that_brakes_in_torque_mode_is_not_waited_for(world):
     assert requests(here) == ["quick_stop", "disable"]
 
 
-def test_without_standstill_the_quick_stop_is_left_and_that_is_loud(world):
-    """Without friction the shaft goes on turning at zero torque."""
+def test_without_standstill_the_quick_stop_remains_and_the_report_is_urgent(world):
+    """Without friction the shaft continues to turn at zero torque."""
     here = turning(world, coulomb=0.0, viscous=0.0)
     report = here.stop_sequence().run()
     assert not report.confirmed and report.stayed_in_torque_mode
@@ -85,7 +85,7 @@ def test_trapped_torque_is_released_on_the_ramp():
 
 
 def test_torque_that_accelerates_the_shaft_falls_at_once():
-    """The load came off: on the ramp, 300 N·m would drive it beyond each limit."""
+    """The load is lost: on the ramp, 300 N·m would drive the shaft beyond each limit."""
     here = wound_up(stiffness=1e-3, speed=4.0, viscous=0.0)
     here.drive.angle = 0.0
     report = here.stop_sequence().run()
@@ -105,7 +105,7 @@ def test_a_drive_that_leaves_torque_mode_on_the_ramp_gets_the_quick_stop(changes
 
 
 def test_a_run_without_another_cause_ends_with_that(world):
-    """Its own setpoints were followed to the end: the drive has stopped to change its mode since."""
+    """The drive follows all setpoints of the run. It changes its mode no longer in the stop."""
     here = world(FakeDrive(quick_stop_in_torque_mode=False))
     limited = here.runner()
     plain = here.drive.exchange

@@ -1,4 +1,4 @@
-"""Stopping with a drill string: its trapped torque comes down on the ramp, and nobody lets go of a wound-up string."""
+"""Stop with a drill string: the trapped torque falls on the ramp, and a twisted string is never disabled."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ LIMITS = StringReleaseLimits(torque_nm=400.0, speed_rad_s=10.0, ramp_nm_s=20.0, 
 
 
 def torques(here):
-    """Every torque that was reported, from the beginning of the stop."""
+    """Return every reported torque since the beginning of the stop."""
     seen = []
     here.drive.misbehave = lambda drive, sample: (seen.append(sample.torque_nm), sample)[1]
     return seen
@@ -49,18 +49,18 @@ def test_trapped_torque_comes_down_on_the_ramp_before_anything_is_disabled(twist
     assert here.drive.calls.index("quick_stop") > 0.9 * abs(twist_nm) / 20.0 / PERIOD_S   # on the ramp, and not before
     calls = [call for call in here.drive.calls if call != "exchange"]
     assert calls == ["quick_stop", "disable"]
-    # Never faster than the ramp, seen over a second; friction's sign is all that jumps.
+    # Never faster than the ramp over a second, except for the sign of friction.
     second = round(1.0 / PERIOD_S)
     falls = [abs(a) - abs(b) for a, b in zip(seen, seen[second:], strict=False)]
     assert max(falls) < 20.0 * 1.5 + 2.0 * here.drive.coulomb
     # Never through zero to the other side.
     sign = math.copysign(1.0, twist_nm)
     assert min(sign * torque for torque in seen) > -RESIDUAL_NM
-    assert here.drive.work_j <= 1e-9   # the motor gave nothing to the string
+    assert here.drive.work_j <= 1e-9   # the motor did no work on the string
 
 
 @pytest.mark.heavy
-def test_reverse_rotation_is_no_more_than_the_twist_asks_for():
+def test_reverse_rotation_is_limited_to_the_twist():
     here = StringWorld(twist_nm=300.0)
     assert not STRING.allow_reverse
     assert here.stop_sequence().run().confirmed
@@ -74,7 +74,7 @@ def test_from_a_turning_shaft_in_either_mode(mode):
     here = StringWorld(speed=4.0, mode=mode, stiffness=10.0, torque=60.0)
     report = here.stop_sequence().run()
     assert report.confirmed, report.trouble
-    assert report.trapped_nm > 20.0                        # what it was wound up by on the way to rest
+    assert report.trapped_nm > 20.0                        # torque that the string took up on the way to standstill
     assert abs(here.drive.string_nm) < 2.0 * RESIDUAL_NM
     assert "quick_stop" in here.drive.calls
     kept = [command.torque_nm for command in here.drive.commands[:2]]
@@ -82,7 +82,7 @@ def test_from_a_turning_shaft_in_either_mode(mode):
 
 
 @pytest.mark.heavy
-def test_a_string_that_swings_is_waited_for():
+def test_the_stop_waits_for_an_oscillating_string():
     here = StringWorld(swing_nm=200.0)
     report = here.stop_sequence().run()
     assert report.confirmed, report.trouble
@@ -90,21 +90,21 @@ def test_a_string_that_swings_is_waited_for():
     assert abs(here.drive.string_nm) < RESIDUAL_NM
 
 
-def test_an_untwisted_string_takes_the_wait_for_half_a_swing_only():
+def test_an_untwisted_string_takes_only_the_wait_of_half_a_period():
     here = StringWorld()
     assert here.stop_sequence().run().confirmed
     assert here.bench.now_s == pytest.approx(QUIET_S + 2 * 1.5, abs=0.5)
 
 
 @pytest.mark.heavy
-def test_the_torque_s_offset_is_nothing_trapped():
+def test_an_offset_of_the_torque_is_no_trapped_torque():
     here = StringWorld()
     here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=sample.torque_nm + 30.0)
     assert here.stop_sequence(torque_offset_nm=30.0).run().confirmed
 
 
 @pytest.mark.heavy
-def test_a_drive_that_leaves_speed_mode_gets_the_quick_stop_and_is_left_holding():
+def test_a_drive_that_leaves_speed_mode_gets_the_quick_stop_and_stays_enabled():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(mode=None)
     report = here.stop_sequence().run()
@@ -117,7 +117,7 @@ def test_a_drive_that_leaves_speed_mode_gets_the_quick_stop_and_is_left_holding(
 
 
 @pytest.mark.heavy
-def test_a_drive_that_falls_out_while_it_lets_go():
+def test_a_drive_that_leaves_operation_during_the_release():
     here = StringWorld(twist_nm=300.0)
 
     def fault(drive, sample):
@@ -134,7 +134,7 @@ def test_a_drive_that_falls_out_while_it_lets_go():
 
 
 def test_a_drive_without_torque_holds_nothing():
-    """In fault the string has turned back by itself already."""
+    """The string has already turned back without control in fault."""
     here = StringWorld(twist_nm=0.0)
     here.drive.fault()
     report = here.stop_sequence().run()
@@ -151,7 +151,7 @@ def test_torque_that_is_still_reported_by_a_drive_without_any_is_not_held():
 
 
 @pytest.mark.heavy
-def test_torque_that_does_not_come_down_is_given_up_and_held():
+def test_a_release_without_effect_is_given_up_and_the_torque_is_held():
     here = StringWorld(twist_nm=300.0)
     here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=300.0)
     report = here.stop_sequence().run()
@@ -195,7 +195,7 @@ def test_a_shaft_that_does_not_follow_speed_mode_gets_the_quick_stop():
 
     def deaf(command):
         if here.drive.state is PowerState.ENABLED:
-            here.drive.torque = 0.0                       # goes on turning as before
+            here.drive.torque = 0.0                       # continues to turn
         else:
             here.drive.angle = 0.0
             plain(command)
@@ -208,7 +208,7 @@ def test_a_shaft_that_does_not_follow_speed_mode_gets_the_quick_stop():
 
 
 @pytest.mark.parametrize("last", ["none", "nan"])
-def test_it_begins_from_a_speed_of_zero_where_none_is_known(last):
+def test_it_begins_from_zero_if_the_speed_is_unknown(last):
     here = StringWorld()
     here.bench.last = None if last == "none" else here.bench.last._replace(speed_rad_s=NAN)
     assert here.stop_sequence().run().confirmed
@@ -218,7 +218,7 @@ def test_it_begins_from_a_speed_of_zero_where_none_is_known(last):
 @pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("told", [40.0, -40.0, 1e12, NAN])
 def test_one_wrong_report_is_not_followed(told):
-    """What tripped the run is the last report; a ramp from there would drive the shaft up to it."""
+    """The last report tripped the run. A ramp from this speed would accelerate the shaft to it."""
     here = StringWorld(speed=4.0, stiffness=10.0)
     here.drive.wish = PowerState.ENABLED
     here.drive.misbehave = lambda drive, sample: sample._replace(speed_rad_s=told) if drive.cycles == 3 else sample
@@ -237,7 +237,7 @@ def test_a_speed_beyond_the_limit_is_braked_from_the_limit():
     assert here.drive.commands[0].speed_rad_s == pytest.approx(10.0 - 2.0 * PERIOD_S)
 
 
-def test_backwards_too_it_comes_to_rest_first():
+def test_reverse_rotation_too_is_stopped_first():
     here = StringWorld(replace(STRING, allow_reverse=True), speed=-3.0, stiffness=5.0)
     report = here.stop_sequence().run()
     assert report.confirmed, report.trouble
@@ -245,17 +245,17 @@ def test_backwards_too_it_comes_to_rest_first():
     assert report.trapped_nm < 0.0
 
 
-# -- letting go, pure ----------------------------------------------------------------------------------------------
+# -- release without a drive -----------------------------------------------------------------------------------------
 
 
-def letting_go(limits=LIMITS, period_s=0.02):
+def release_of(limits=LIMITS, period_s=0.02):
     return StringRelease(limits, 0.05, period_s)
 
 
 @settings(max_examples=60)
 @given(rows=st.lists(st.tuples(st.floats(-500.0, 500.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60))
-def test_it_only_ever_yields(rows):
-    going = letting_go()
+def test_the_release_never_winds_the_string_up(rows):
+    going = release_of()
     for torque, speed in rows:
         wanted = going.step(torque, speed)
         assert wanted * torque <= 0.0
@@ -263,23 +263,23 @@ def test_it_only_ever_yields(rows):
 
 
 @pytest.mark.parametrize("wrong", [(NAN, 0.0), (0.0, NAN), (math.inf, 0.0), (0.0, -math.inf)])
-def test_what_is_no_number_holds_the_shaft(wrong):
-    going = letting_go()
+def test_a_report_that_is_no_number_holds_the_shaft(wrong):
+    going = release_of()
     assert going.torque_nm == 0.0
     for _ in range(200):
         going.step(0.0, 0.0)
     assert going.step(*wrong) == 0.0
     for _ in range(299):
         going.step(0.0, 0.0)
-    assert not going.done              # the quiet began anew
+    assert not going.done              # the quiet time restarted
     for _ in range(2):
         going.step(0.0, 0.0)
     assert going.done
 
 
-def test_torque_about_zero_has_no_side_that_it_could_change():
-    """Ripple below what counts as none: what comes after it is yielded to as if there had been no ripple."""
-    calm, rippled = letting_go(), letting_go()
+def test_torque_about_zero_has_no_sign():
+    """The ripple is below the residual torque. The release of a later torque is that without ripple."""
+    calm, rippled = release_of(), release_of()
     for k in range(600):
         calm.step(0.0, 0.0)
         rippled.step(0.6 * RESIDUAL_NM * (-1.0) ** (k // 30), 0.0)
@@ -289,8 +289,8 @@ def test_torque_about_zero_has_no_side_that_it_could_change():
 @settings(max_examples=25, deadline=None)
 @given(stiffness=st.floats(20.0, 20_000.0), lag_s=st.sampled_from([0.0, 0.15, 0.4]), trapped=st.floats(-380.0, 380.0))
 def test_trapped_torque_of_any_string_is_released_behind_any_plausible_lag(stiffness, lag_s, trapped):
-    """From 20 to 20 000 N·m/rad, the torque seen through a lag and the speed followed through another."""
-    going, angle, seen, speed = letting_go(), trapped / stiffness, trapped, 0.0
+    """The stiffness is 20 to 20 000 N·m/rad. Reported torque and speed control have different lags."""
+    going, angle, seen, speed = release_of(), trapped / stiffness, trapped, 0.0
     for _ in range(round(going.longest_s / 0.02) + 4000):
         wanted = going.step(seen, speed)
         speed += (wanted - speed) * min(1.0, 0.02 / 0.05)
@@ -305,7 +305,7 @@ def test_trapped_torque_of_any_string_is_released_behind_any_plausible_lag(stiff
 
 def test_an_oscillation_faster_than_any_string_makes_it_stiffer():
     def yields_after(swing_s):
-        going = letting_go()
+        going = release_of()
         for step in range(1000):
             going.step(200.0 * math.sin(2.0 * math.pi * 0.02 * step / swing_s), 0.0)
         for _ in range(40):
@@ -319,7 +319,7 @@ def test_an_oscillation_faster_than_any_string_makes_it_stiffer():
 def test_an_oscillation_within_a_few_cycles_makes_it_stiffer_though_the_mean_hides_it():
     """A report every 65 ms, and a torque that changes its sign every second cycle. The speed follows it."""
     def yields_after(torque_nm, speed_rad_s=1.0, position_rad=None):
-        going = letting_go(period_s=0.065)
+        going = release_of(period_s=0.065)
         for step in range(80):
             side = 1.0 if step % 4 < 2 else -1.0
             going.step(side * torque_nm, side * speed_rad_s, None if position_rad is None else side * position_rad)
@@ -335,8 +335,8 @@ def test_an_oscillation_within_a_few_cycles_makes_it_stiffer_though_the_mean_hid
         40.0 / 80.0 / STIFFEST, rel=1e-6)
 
 
-def test_its_bounds_in_time_and_travel():
-    going = letting_go()
+def test_limits_of_the_release_in_time_and_travel():
+    going = release_of()
     going.step(100.0, 0.0)
     assert going.longest_s == pytest.approx(2.0 * 100.0 / 20.0 + 90.0)
     steps = 0
@@ -344,7 +344,7 @@ def test_its_bounds_in_time_and_travel():
         going.step(100.0, 0.0)
         steps += 1
     assert steps * 0.02 == pytest.approx(100.0, abs=0.05)
-    slow = letting_go(replace(LIMITS, ramp_nm_s=0.1))
+    slow = release_of(replace(LIMITS, ramp_nm_s=0.1))
     steps = 0
     while not slow.failed:
         slow.step(-5000.0 if steps else -100.0, 0.0)
@@ -353,12 +353,12 @@ def test_its_bounds_in_time_and_travel():
 
 
 @pytest.mark.parametrize(("limit", "resolution", "residual"), [(400.0, 1.0, 8.0), (400.0, 10.0, 50.0)])
-def test_what_counts_as_nothing(limit, resolution, residual):
+def test_residual_torque(limit, resolution, residual):
     limits = replace(LIMITS, torque_nm=limit, torque_resolution_nm=resolution)
     assert limits.residual_nm == residual
 
 
-# -- patience ------------------------------------------------------------------------------------------------------
+# -- waiting time ------------------------------------------------------------------------------------------------------
 
 
 def waited(speeds, enough_s=19.0, period_s=0.5):
@@ -381,24 +381,24 @@ def endless(first, factor):
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_shaft_that_gets_slower_is_waited_for_and_one_that_does_not_is_not(sign):
+def test_the_stop_waits_only_for_a_shaft_that_slows_down(sign):
     assert waited(endless(sign * 10.0, 1.0)) == pytest.approx(19.5)
     assert waited([*[sign * (10.0 - 0.05 * k) for k in range(100)], *[5.0] * 1000]) == pytest.approx(50.0 + 15.5, abs=6)
     assert waited(endless(sign * 10.0, 0.998)) == pytest.approx(LONGEST_S + 0.5, abs=0.6)
-    assert waited(endless(sign * 10.0, 0.9995)) == pytest.approx(19.5)     # half a percent in a block is nothing
+    assert waited(endless(sign * 10.0, 0.9995)) == pytest.approx(19.5)     # half a percent per block does not count
 
 
-def test_noise_at_rest_is_no_getting_slower():
+def test_noise_at_standstill_is_no_slowing_down():
     assert waited(endless(0.04, 0.99)) == pytest.approx(19.5)
     assert waited([None] * 1000) == pytest.approx(19.5)
 
 
-def test_a_long_ramp_is_waited_for_in_any_case():
+def test_the_stop_always_waits_for_a_long_ramp():
     assert waited(endless(10.0, 1.0), enough_s=60.0) == pytest.approx(60.5)
     assert BLOCK_S == 5.0
 
 
-# -- what a string forbids -----------------------------------------------------------------------------------------
+# -- refusals with a string ----------------------------------------------------------------------------------------
 
 
 REAL = Identity(1, 2, 3, 4, "real", simulated=False)
@@ -434,7 +434,7 @@ def test_what_a_string_forbids(limits, request_, preflight, what):
 
 
 @pytest.mark.parametrize("limits", [STRING, replace(STRING, load="none")])
-def test_an_echo_is_not_looked_for_without_a_pipe(limits):
+def test_without_pipe_data_there_is_no_echo(limits):
     with pytest.raises(PreflightRefused, match="whose pipe is known") as caught:
         refuse_with_string(limits, ExcitationRequest(kind="prbs"), preflight_of())
     assert "length_m" in caught.value.next_step
@@ -446,7 +446,7 @@ def test_an_echo_is_not_looked_for_without_a_pipe(limits):
 
 @pytest.mark.parametrize("title", ["quick-stop option", "something else"])
 @pytest.mark.parametrize("found", ["0", "6", "?"])
-def test_what_a_string_allows_hangs_on_no_row_of_the_table(title, found):
+def test_permissions_with_a_string_do_not_depend_on_rows_of_the_table(title, found):
     row = Check(title, "6", found, Outcome.OK, "605Ah")
     refuse_with_string(STRING, ExcitationRequest(), preflight_of(checks=(row, refused_check())))
 
@@ -458,8 +458,8 @@ def test_a_run_with_a_string_is_refused_before_anything_moves(world):
     assert "exchange" not in here.drive.calls
 
 
-def test_a_drive_that_changes_to_speed_mode_late_does_not_drop_the_string_s_torque():
-    """Until it shows speed mode, the target torque still acts."""
+def test_a_late_change_to_speed_mode_does_not_drop_the_torque_of_the_string():
+    """The target torque acts until the drive displays speed mode."""
     here, late = StringWorld(twist_nm=300.0), 10
 
     def switches_late(drive, sample):

@@ -1,4 +1,4 @@
-"""What the stop sequence sees of a shaft once its torque is off."""
+"""Stop sequence after the drive is disabled: reports of the shaft."""
 
 import math
 
@@ -12,7 +12,7 @@ from tests.runner.stop_calls import LAG_S, SILENT
 
 
 def when_off(drive, speeds):
-    """A misbehaviour: what the shaft shows from the moment it is disabled on, a value a second; then the last."""
+    """Misbehaviour: values that the drive reports after it is disabled, one per second; the last one stays."""
     since = []
 
     def change(_, sample):
@@ -26,7 +26,7 @@ def when_off(drive, speeds):
     return since
 
 
-def test_a_shaft_that_begins_to_turn_once_it_is_disabled_is_told_and_watched(world):
+def test_a_shaft_that_begins_to_turn_once_it_is_disabled_is_reported_and_watched(world):
     here = world()
     here.turn(5.0)
     since = when_off(here.drive, [0.0, 0.4, 0.2, -0.1, 0.0])
@@ -38,7 +38,7 @@ def test_a_shaft_that_begins_to_turn_once_it_is_disabled_is_told_and_watched(wor
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_shaft_that_goes_on_turning_once_it_is_disabled_is_not_confirmed(world, sign):
+def test_a_shaft_that_continues_to_turn_once_it_is_disabled_is_not_confirmed(world, sign):
     here = world()
     here.turn(5.0)
     since = when_off(here.drive, [sign * 0.4])
@@ -51,7 +51,7 @@ def test_a_shaft_that_goes_on_turning_once_it_is_disabled_is_not_confirmed(world
 
 
 def test_a_shaft_that_turns_by_its_position_once_it_is_disabled_is_not_confirmed(world):
-    """Its speed signal was lost in the same moment."""
+    """The speed signal is lost at the same time."""
     here = world(Reporting(with_position=True))
     here.turn(5.0)
     here.guard.observer.position(1e-3, math.inf)
@@ -65,7 +65,7 @@ def test_a_shaft_that_turns_by_its_position_once_it_is_disabled_is_not_confirmed
     assert "rad/s by its position) once its torque was off" in report.trouble[-1]
 
 
-def test_a_shaft_at_rest_is_watched_for_as_long_as_reports_may_lag(world):
+def test_a_shaft_at_standstill_is_watched_for_as_long_as_reports_may_lag(world):
     here = world()
     here.turn(5.0)
     since = when_off(here.drive, [0.0])
@@ -78,7 +78,7 @@ def test_lost_frames_afterwards_and_silence_afterwards(world):
     here.turn(5.0)
     when_off(here.drive, [0.0, None, None, None])
     report = here.stop_sequence().run()
-    assert report.confirmed            # it was seen at rest, and disabled
+    assert report.confirmed            # it was at standstill and disabled
     assert "sent no feedback" in report.trouble[-1]
     here = world()
     here.turn(5.0)

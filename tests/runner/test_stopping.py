@@ -1,4 +1,4 @@
-"""The rule by which stage 5 ends: what looking costs, and that the working confidence pays for it."""
+"""Rule for the end of stage 5: cost of interim looks, and working confidence that compensates for them."""
 
 import math
 
@@ -12,7 +12,7 @@ from tdhil.runner.design.stopping_rule import aimed_scatter, least_scale, workin
 
 
 def simulated_coverage(confidence, dof, threshold, looks, runs=200_000):
-    """Mean of unit variance; pilots as the unit of length; looks at the variance only, and stops when it is enough."""
+    """Simulate the coverage of a mean. The unit of length is the pilot. The rule uses the variance only."""
     rng = np.random.default_rng(5)
     variance, length = rng.chisquare(dof, runs) / dof, np.ones(runs)
     squared = student.ppf(0.5 + 0.5 * confidence, dof) ** 2 * threshold
@@ -23,7 +23,7 @@ def simulated_coverage(confidence, dof, threshold, looks, runs=200_000):
         own = rng.chisquare(np.maximum(dof * added, 1e-9))
         variance = (dof * length * variance + np.where(added > 0.0, own, 0.0)) / (dof * (length + added))
         length = length + added
-    error = rng.standard_normal(runs) / np.sqrt(length)      # independent of every scatter
+    error = rng.standard_normal(runs) / np.sqrt(length)      # independent of the scatter
     half = student.ppf(0.5 + 0.5 * confidence, dof * length) * np.sqrt(variance / length)
     return float(np.mean(np.abs(error) <= half))
 
@@ -31,12 +31,12 @@ def simulated_coverage(confidence, dof, threshold, looks, runs=200_000):
 @pytest.mark.heavy
 @pytest.mark.parametrize("looks", [1, 3])
 @pytest.mark.parametrize("threshold", [0.7, 0.9])
-def test_the_working_confidence_makes_up_for_looking(threshold, looks):
+def test_the_working_confidence_compensates_for_interim_looks(threshold, looks):
     chance = 3.0 * math.sqrt(0.05 * 0.95 / 200_000)
     plain = simulated_coverage(0.95, 16.0, threshold, looks)
     mended = simulated_coverage(working_confidence(0.95, 16.0), 16.0, threshold, looks)
-    assert plain < 0.9475                                    # looking does cost something
-    assert plain >= worst_coverage(0.95, 16.0) - chance      # and no more than is reckoned with
+    assert plain < 0.9475                                    # interim looks reduce the coverage
+    assert plain >= worst_coverage(0.95, 16.0) - chance      # and by no more than the rule assumes
     assert mended >= 0.95 - chance
 
 
@@ -52,7 +52,7 @@ def test_the_correction_is_small_and_vanishes_with_a_long_pilot(confidence):
     assert worst_coverage(working[1], 20.0) == pytest.approx(confidence, abs=1e-6)
 
 
-def test_the_scatter_that_is_reckoned_with_is_exceeded_as_often_as_said():
+def test_the_assumed_scatter_is_exceeded_with_the_stated_probability():
     rng = np.random.default_rng(1)
     dof, added = 20.0, 30.0
     ratio = rng.chisquare(added, 200_000) / added / (rng.chisquare(dof, 200_000) / dof)
@@ -82,7 +82,7 @@ def test_the_least_scale_is_found(floor, tolerance):
     assert len(asked) <= 6
 
 
-def test_out_of_reach_no_time_is_spent_for_nothing():
+def test_no_time_is_used_for_an_unreachable_tolerance():
     scale, then, enough = least_scale(lambda x: math.sqrt(0.03**2 / x + 0.02**2), 0.01, 100.0)
     assert not enough
     assert scale < 15.0                                       # ±2.2 % there, ±2.02 % at a hundred

@@ -1,4 +1,4 @@
-"""A string that rings behind a stiff speed loop: damped before anything is read off it; no reason to doubt a sign."""
+"""String that oscillates below a stiff speed loop: it is damped before a measurement, and raises no doubt of a sign."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ STEPS = 10
 
 @dataclass
 class RingingDrive(FakeDrive):
-    """Two masses on a spring under a stiff PI loop; the demand that it shows is that of the cycle before.
+    """Two masses on a spring under a stiff PI loop. The reported demand is that of the cycle before.
 
-    ``unsigned``: a torque setpoint below zero is taken for full torque forward. ``bit_nm`` and ``bit_s``: a swing at
-    the bottom that nothing takes away.
+    ``unsigned``: a negative torque setpoint acts as full torque forward. ``bit_nm`` and ``bit_s``: an oscillation at
+    the bit that does not decay.
     """
 
     inertia: float = 1500.0
@@ -103,15 +103,15 @@ class RingingDrive(FakeDrive):
 
 
 def ringing(**drive):
-    """A bench whose shaft turns at 3 rad/s, over a string that rings by about 1 kN·m."""
+    """Bench whose shaft turns at 3 rad/s above a string with an oscillation of about 1 kN·m."""
     here = World(RingingDrive(**drive), LIMITS)
     here.bench.enable(Mode.SPEED, Command(Mode.SPEED, 0.0, 0.0))
     here.bench.hold(Command(Mode.SPEED, 3.0, 0.0), 8.0)
     return here
 
 
-def test_ramps_before_their_echo_tell_the_inertia_above_the_string(world):
-    """Up and down between two speeds, each ramp shorter than the echo; the pipe is nearly weightless here."""
+def test_ramps_before_their_echo_give_the_inertia_above_the_string(world):
+    """Each ramp between two speeds is shorter than the round-trip time. The pipe has nearly no inertia."""
     limits = replace(LIMITS, load="string", torque_ramp_nm_s=40.0, echo_s=2.0, wave_impedance_nm_s_rad=1e-3)
     here = World(limits=limits)
     here.turn(4.0)
@@ -121,7 +121,7 @@ def test_ramps_before_their_echo_tell_the_inertia_above_the_string(world):
     assert inertia_before_echo(here.bench, limits, (3.0, 4.0), None) is None
 
 
-def test_a_top_that_yields_damps_what_a_stiff_one_holds_on_to():
+def test_a_compliant_top_damps_an_oscillation_that_a_stiff_one_sustains():
     stiff = ringing()
     held = stiff.bench.hold(Command(Mode.SPEED, 3.0, 0.0), 20.0)
     left_stiff = swing_of(held[-300:], PERIOD_S).torque_nm
@@ -135,7 +135,7 @@ def test_a_top_that_yields_damps_what_a_stiff_one_holds_on_to():
 
 
 @pytest.mark.heavy
-def test_a_sound_drive_over_a_ringing_string_is_not_called_wrong_signed():
+def test_a_right_sign_above_an_oscillating_string_is_accepted():
     here = World(RingingDrive(), LIMITS)
     run = here.runner(ExcitationRequest(periods=2)).run()
     assert run.cause is None, run.cause
@@ -145,7 +145,7 @@ def test_a_sound_drive_over_a_ringing_string_is_not_called_wrong_signed():
 
 
 @pytest.mark.heavy
-def test_a_wrong_sign_over_a_ringing_string_is_still_refused():
+def test_a_wrong_sign_above_an_oscillating_string_is_refused():
     here = World(RingingDrive(unsigned=True), LIMITS)
     run = here.runner(ExcitationRequest(periods=2)).run()
     assert isinstance(run.cause, PreflightRefused), run.cause
@@ -154,7 +154,7 @@ def test_a_wrong_sign_over_a_ringing_string_is_still_refused():
     assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
 
 
-def test_a_string_that_sticks_and_slips_is_named_with_its_period_and_amplitude():
+def test_stick_slip_is_reported_with_its_period():
     here = ringing(bit_nm=1500.0)
     with pytest.raises(LimitHit, match=r"stick-slip at 3\.00 rad/s: .* every 5\.[1-5] s") as hit:
         calm_string(here.bench, LIMITS, 3.0, 0.5)
@@ -162,8 +162,8 @@ def test_a_string_that_sticks_and_slips_is_named_with_its_period_and_amplitude()
     assert "Lift the bit off bottom" in str(hit.value)
 
 
-def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
-    """As regular, but the bit turns all the while: by ζ and the mean speed it would swing by 3 kN·m if it stuck."""
+def test_an_oscillation_that_noise_sustains_is_no_stick_slip():
+    """It is as regular, but the bit always turns. By ζ and the mean speed, stick-slip would have 3 kN·m."""
     limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
     here = ringing(bit_nm=400.0)
     calmed = calm_string(here.bench, limits, 3.0, 0.5)
@@ -173,9 +173,11 @@ def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
 
 
 @pytest.mark.heavy
-def test_a_restless_string_is_stick_slip_only_where_its_bit_stops():
-    """3,000 m under a stiff loop, from a simulator of its own: 120 rpm sticks, 179 and 205 rpm turn under 0.8 kN·m of
-    bit noise. Their torque swings by more than 0.6 ζω, which used to be called stick-slip."""
+def test_an_oscillation_is_stick_slip_only_if_the_bit_stops():
+    """A bit below 3,000 m of pipe and a stiff loop sticks at 120 rpm and turns at 179 and 205 rpm (other simulator).
+
+    The bit noise is 0.8 kN·m. The torque amplitude exceeds 0.6 ζω in all cases, which used to count as stick-slip.
+    """
     rpm = np.array([[120.0, 179.0, 205.0]])
     time, torque, top, bit = recorded(**reference_case(noise_nm=800.0, rpm=rpm, periods=9.0))
     late = time > time[-1] - 24.0
@@ -197,14 +199,14 @@ PULSE = Pulse(200.0, -600.0, 20, 0, 0.3, 6.0)
 CALM = [seen(200.0 + 5.0 * (-1) ** n) for n in range(50)]
 
 
-def test_the_speed_loops_demand_at_the_switch_is_no_answer():
+def test_the_demand_of_the_speed_loop_at_the_switch_is_no_answer():
     listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
     assert listener.hear(seen(demand_nm=500.0)) is None
     assert listener.hear(seen(demand_nm=-600.0)) is None
     assert listener.hear(seen(demand_nm=500.0)) is BrakingAnswer.FASTER
 
 
-def test_a_demand_that_stays_up_is_an_answer_once_it_would_have_had_to_follow():
+def test_a_demand_that_stays_high_is_an_answer_after_the_time_to_follow():
     listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
     assert [listener.hear(seen(demand_nm=4000.0)) for _ in range(5)] == [None] * 4 + [BrakingAnswer.FASTER]
 
@@ -214,13 +216,13 @@ def test_a_demand_that_had_followed_the_switch_is_an_answer_at_once():
                            demand_nm=210.0).hear(seen(demand_nm=4000.0)) is BrakingAnswer.FASTER
 
 
-def test_the_torque_itself_is_an_answer_whatever_the_demand():
+def test_the_torque_itself_is_an_answer_for_any_demand():
     listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
     assert BrakingAnswer.FASTER in [listener.hear(seen(3000.0, demand_nm=None)) for _ in range(3)]
     assert listener.why == f"the reported torque went from {in_nm(200.0)} to {in_nm(3000.0)}"
 
 
-def test_there_is_no_pulse_where_the_string_hides_its_answer():
+def test_there_is_no_pulse_if_the_oscillation_hides_its_response():
     guess = RigGuess(2000.0, 20.0, 90.0)
     calm = plan_pulse(LIMITS, guess, ControlAssumptions(), Before(2.9, 200.0, 0.03, 60.0), PERIOD_S)
     swings = plan_pulse(LIMITS, guess, ControlAssumptions(), Before(2.9, 200.0, 0.03, 500.0), PERIOD_S)
@@ -232,7 +234,7 @@ def test_there_is_no_pulse_where_the_string_hides_its_answer():
 
 
 @pytest.mark.parametrize("period_s", [2.5, 5.3, 9.0])
-def test_the_period_of_a_swing_is_found(period_s):
+def test_the_period_of_an_oscillation_is_found(period_s):
     time_s = np.arange(0.0, 24.0, PERIOD_S)
     swing = swing_of([seen(200.0 + 500.0 * math.sin(2.0 * math.pi * t / period_s), time_s=t) for t in time_s], PERIOD_S)
     assert swing.torque_nm == pytest.approx(500.0, rel=0.05)
@@ -240,7 +242,7 @@ def test_the_period_of_a_swing_is_found(period_s):
     assert swing.regular > 0.9
 
 
-def test_noise_repeats_nowhere():
+def test_noise_is_not_regular():
     noise = np.random.default_rng(1).normal(0.0, 300.0, 24 * 50)
     swing = swing_of([seen(200.0 + one, time_s=n * PERIOD_S) for n, one in enumerate(noise)], PERIOD_S)
     assert swing.regular < 0.6
@@ -256,7 +258,7 @@ def test_yielding_stays_within_its_bounds_and_forward():
     assert damper.step(math.nan) == 0.4
 
 
-def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
+def test_no_plan_fits_a_window_that_the_oscillation_fills():
     here = World(FakeDrive(), LIMITS)
     here.guard.disturbed = Swing(1200.0, 3.2, 5.3, 0.9).words
     speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.2, 5.3, 0.9))
@@ -269,7 +271,7 @@ def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("bit_nm", [0.0, 400.0])
-def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried(bit_nm):
+def test_an_oscillation_that_begins_before_the_probe_is_found(bit_nm):
     limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
     here = ringing(bit_nm=bit_nm)
     before = SpeedResult(None, SimpleNamespace(speed_rad_s=3.0), RigGuess(1500.0, 8.0, 60.0), None, None, ())
@@ -280,13 +282,13 @@ def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried
         assert (mean, here.guard.disturbed) == (pytest.approx(slow_speed(limits), abs=0.05), "")
     else:
         assert found.wander_rad_s > 0.1
-        assert mean == pytest.approx(slow_speed(limits, found.wander_rad_s), abs=0.4)      # it swings, and yields
+        assert mean == pytest.approx(slow_speed(limits, found.wander_rad_s), abs=0.4)      # it yields
         assert mean > slow_speed(limits) + 0.5
         assert "the string below oscillates with ±" in here.guard.disturbed
 
 
 @pytest.mark.parametrize(("torque_nm", "level_s"), [(0.0, LEVEL_S), (1200.0, OSCILLATING_LEVEL_S)])
-def test_over_a_string_that_keeps_oscillating_a_level_is_longer(world, monkeypatch, torque_nm, level_s):
+def test_above_an_oscillating_string_an_operating_point_takes_longer(world, monkeypatch, torque_nm, level_s):
     here, swing = world(limits=LIMITS), Swing(torque_nm, 0.5, 5.3, 0.9)
     here.turn(3.0)
     damper = SwingDamper(LIMITS.torque_nm, LIMITS.speed_max_rad_s, 3.0, PERIOD_S)
@@ -296,14 +298,14 @@ def test_over_a_string_that_keeps_oscillating_a_level_is_longer(world, monkeypat
     assert OSCILLATING_LEVEL_S > 4.0 * swing.period_s > LEVEL_S
 
 
-def test_whichever_swing_takes_the_shaft_further_counts():
+def test_the_larger_oscillation_counts():
     near, far = Swing(900.0, 0.2, 0.0, 0.0), Swing(300.0, 0.5, 0.0, 0.0)
     assert widest(near, far) is far is widest(far, near) is widest(None, far)
     assert widest(None, None) is None
 
 
-def test_a_plan_that_ends_where_no_braking_torque_is_needed_needs_none():
-    """What is left below zero is the arithmetic's."""
+def test_a_plan_that_ends_without_braking_torque_needs_none():
+    """The remaining negative torque is a rounding error."""
     limits = replace(LIMITS, speed_min_rad_s=15.0, speed_max_rad_s=26.0, torque_nm=15000.0)
     for coulomb_nm in (3000.0, 3330.0, 3340.0, 3401.7):
         here = World(FakeDrive(), limits)
@@ -317,7 +319,7 @@ def test_a_plan_that_ends_where_no_braking_torque_is_needed_needs_none():
 
 
 @pytest.mark.parametrize(("echo_s", "kind", "told"), [(1.4, "multisine", 1), (1.4, "prbs", 0), (0.0, "multisine", 0)])
-def test_above_a_restless_string_it_is_said_before_stage_5_what_would_tell_more(echo_s, kind, told):
+def test_above_an_oscillating_string_a_better_motion_is_advised_before_stage_5(echo_s, kind, told):
     limits = replace(LIMITS, speed_min_rad_s=15.0, speed_max_rad_s=26.0, echo_s=echo_s)
     here = World(FakeDrive(), limits)
     speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(300.0, 0.5, 5.3, 0.9))
@@ -328,7 +330,7 @@ def test_above_a_restless_string_it_is_said_before_stage_5_what_would_tell_more(
 
 
 class KeepingLog(FakeLog):
-    """Keeps what a recording is made of."""
+    """Log that keeps the parts of a recording."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -349,7 +351,7 @@ class KeepingLog(FakeLog):
 
 
 @pytest.mark.heavy
-def test_a_run_that_is_told_before_an_echo_learns_how_its_torque_answered():
+def test_a_run_with_ramps_before_the_echo_measures_the_torque_response():
     here = World(RingingDrive(), replace(LIMITS, wave_impedance_nm_s_rad=486.0, echo_s=2.0))
     here.log = KeepingLog()
     run = here.runner(ExcitationRequest(kind="prbs", periods=3)).run()
@@ -357,12 +359,12 @@ def test_a_run_that_is_told_before_an_echo_learns_how_its_torque_answered():
     assert here.log.facts["torque_answer"].lag_s < 0.01
 
 
-def test_the_damper_yields_to_the_swing_about_the_mean_and_within_its_bounds():
+def test_the_damper_yields_to_the_oscillation_about_the_mean_within_its_limits():
     damper = SwingDamper(4000.0, 10.0, 2.0, PERIOD_S)
-    assert [damper.step(500.0) for _ in range(100)] == [2.0] * 100            # friction moves no mean speed
+    assert [damper.step(500.0) for _ in range(100)] == [2.0] * 100            # friction changes no mean speed
     first, later = damper.step(900.0), [damper.step(900.0) for _ in range(25)][-1]
     assert 2.0 > first > later > 2.0 - 0.1 * 10.0                             # smoothed over 0.2 s
-    assert damper.step(math.nan) == 2.0                                       # a missing report is no swing
+    assert damper.step(math.nan) == 2.0                                       # a missing report is no oscillation
     assert [damper.step(4000.0) for _ in range(50)][-1] == 1.0                # a tenth of the speed limit
     assert [damper.step(-4000.0) for _ in range(50)][-1] == 3.0
     slow = SwingDamper(4000.0, 10.0, 0.5, PERIOD_S)

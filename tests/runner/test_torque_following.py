@@ -1,4 +1,4 @@
-"""Means of reported and commanded torque, over a window of torque mode."""
+"""Mean reported and commanded torque over a window of torque mode."""
 
 import pytest
 

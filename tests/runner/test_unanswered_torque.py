@@ -88,7 +88,7 @@ def test_a_speed_that_leaves_its_noise_in_both_directions_together_has_answered(
     assert found(lambda time_s: HOLDING_NM if time_s < 1.0 else 2.0 * HOLDING_NM, speed_of) is None
 
 
-def test_after_an_answer_the_balance_begins_anew():
+def test_after_a_response_the_balance_restarts():
     def torque_of(time_s):
         return HOLDING_NM if time_s < 4.95 else 4.0 * HOLDING_NM + 60.0 * math.cos(2.0 * math.pi * (time_s - 5.0))
 
@@ -136,7 +136,7 @@ def test_a_shaft_is_not_held_without_each_of_these(other):
     assert held(**other) is None
 
 
-def test_the_time_of_a_held_shaft_begins_anew():
+def test_the_time_of_a_held_shaft_restarts():
     stands = {False: 0.0, True: 1.0}
     assert first(HeldShaft(STRING, STILL_RAD_S), lambda _: LIMIT_NM, lambda time_s: stands[time_s % 1.0 > 0.85], 8.0,
                  lambda _: Command(Mode.SPEED, 4.0, 0.0)) is None
@@ -159,7 +159,7 @@ def test_a_torque_at_its_limit_is_no_contradiction_without_each_of_these(other):
     assert strained(**other) is None
 
 
-def test_the_time_at_the_limit_begins_anew():
+def test_the_time_at_the_limit_restarts():
     assert first(TorqueAtLimit(STRING, STILL_RAD_S), lambda time_s: LIMIT_NM * (time_s % 3.0 < 2.85), lambda _: 4.0,
                  12.0, lambda _: Command(Mode.SPEED, 4.0, 0.0), known=False) is None
 
@@ -179,7 +179,7 @@ def test_a_shaft_that_stands_while_the_stop_yields_is_not_measured():
 @pytest.mark.parametrize("other", [
     {"stopping": False}, {"mode_of": lambda _: Mode.TORQUE}, {"speed_of": math.cos}, {"speed_of": lambda _: 1.5},
     {"torque_nm": 0.5 * BREAKAWAY_NM}, {"yield_rad_s": 0.5 * STILL_RAD_S}, {"lag_s": 0.6 * YIELD_S},
-    {"mode_of": lambda time_s: Mode.SPEED if time_s % 3.0 < 2.85 else Mode.TORQUE},        # the time begins anew
+    {"mode_of": lambda time_s: Mode.SPEED if time_s % 3.0 < 2.85 else Mode.TORQUE},        # the time restarts
     {"speed_of": lambda time_s: 0.9 if time_s % 3.5 < 1.0 else 0.0},                       # it moves now and then
 ])
 def test_a_yield_is_not_ignored_without_each_of_these(other):

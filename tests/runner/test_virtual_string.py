@@ -1,4 +1,4 @@
-"""Stage 5 with a virtual string on the fake drive: the stages before it, what ends it, and how the string goes."""
+"""Stage 5 with a virtual string on the fake drive: earlier stages, reasons of its end, and removal of the string."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class RowsLog(FakeLog):
 
 @pytest.fixture
 def course(monkeypatch):
-    """Already laid: what lays it simulates for a second."""
+    """Replace the planned course by a fixed one, since planning simulates for a second."""
     laid = SpeedProgram(45.0 * RPM, 79.0 * RPM, peak_nm=7000.0)
     monkeypatch.setattr("tdhil.runner.stages.virtual_string.program_for", lambda case, window: laid)
 
@@ -55,7 +55,7 @@ def runner(here, case=BENCH, limits=ROOM):
 
 
 def until(here, cycle, what):
-    """``what`` befalls the drive from that cycle of stage 5 on."""
+    """Apply the fault ``what`` to the drive from that cycle of stage 5 on."""
 
     def look(stage, seen):
         if stage == "acquire" and seen == cycle:
@@ -69,7 +69,7 @@ def rows_of(here):
 
 
 def stopped(here, result):
-    """At rest and confirmed; nothing after the last cycle of the stage commanded a torque, and nothing turned back."""
+    """Assert a confirmed stop: no torque command after the last cycle of the stage, and no reverse rotation."""
     assert_at_rest(here, result)
     assert outcomes(result) == up_to("acquire")
     at = here.drive.calls.index("quick_stop")
@@ -89,7 +89,7 @@ def test_ctrl_c_while_the_bit_sticks_takes_the_string_away_first(world, course):
     stopped(here, result)
     rows = rows_of(here)
     assert rows["phase"].max() == Phase.RAMP and (rows["bit_rad_s"][-700:] == 0.0).any()
-    assert np.ptp(rows["top_rad_s"][-700:]) > 2.0      # it stuck and slipped
+    assert np.ptp(rows["top_rad_s"][-700:]) > 2.0      # stick-slip
     assert min(speeds) >= 0.0
     assert here.log.run["evaluation"]["program"]["start_rad_s"] > 0.0
 
@@ -121,7 +121,7 @@ def test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest(world
         if name == "powerless":
             keep = here.drive.inertia, here.drive.coulomb, here.drive.viscous
             here.drive.misbehave = powerless
-            # the shaft obeys the stop again
+            # the shaft follows the stop again
             here.drive.quick_stop_was = here.drive.quick_stop
 
             def quick_stop():
@@ -141,7 +141,7 @@ def test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest(world
     result = runner(here).run()
     assert isinstance(result.cause, cause)
     assert re.search(said, str(result.cause))
-    if name != "deaf":      # nobody hears of that shaft any more: its own watchdog is what is left
+    if name != "deaf":      # there is no feedback of this shaft: only its own watchdog remains
         assert here.drive.speed == pytest.approx(0.0, abs=1e-6)
     assert result.stop.confirmed is (name in ("powerless", "off"))
     assert outcomes(result) == up_to("acquire")

@@ -1,1 +1,1 @@
-"""One run, from what was asked for to a closed log."""
+"""Tests of one run, from the request to a closed log."""

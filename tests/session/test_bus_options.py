@@ -1,4 +1,4 @@
-"""The bus: whose word counts, and what is said when it can't be opened."""
+"""Bus options: precedence of their sources, and messages if the bus cannot be opened."""
 
 import argparse
 import json
@@ -21,7 +21,7 @@ from tests.rigs import loaded_rig
 
 @pytest.fixture(autouse=True)
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path, Path]]:
-    """No configuration of the machine that runs the tests; two files of our own instead."""
+    """Use two own configuration files instead of those of this computer."""
     for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG"):
         monkeypatch.delenv(name, raising=False)
     first, second = tmp_path / "can.conf", tmp_path / "canrc"
@@ -105,14 +105,14 @@ def link(*, up: bool = True, bitrate: int | None = 250000, name: str = "can0") -
     return json.dumps([{"ifindex": 3, "ifname": name, "flags": flags, "mtu": 16, "linkinfo": info}])
 
 
-def test_what_ip_says_of_a_link() -> None:
+def test_output_of_ip_for_a_link() -> None:
     assert parse_link(link(), "can0") == (True, 250000)
     assert parse_link(link(up=False), "can0") == (False, 250000)
     assert parse_link(link(bitrate=None, name="vcan0"), "vcan0") == (True, None)
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "[1]", '[{"ifname": "can0", "linkinfo": 3}]', "[" * 99999, "null"])
-def test_what_ip_should_not_say(text: str) -> None:
+def test_invalid_output_of_ip(text: str) -> None:
     assert parse_link(text, "can0") == (True, None)
 
 
@@ -176,8 +176,8 @@ def daemon(port: int, *more: str) -> CanLine:
     return can_line(cli("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1", f"port={port}", *more))
 
 
-def test_no_socketcand_server_is_found_out_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before python-can is asked, which takes 10 s."""
+def test_a_missing_socketcand_server_is_found_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check precedes that of python-can, which takes 10 s."""
     monkeypatch.setattr(can, "Bus", lambda *_, **__: pytest.fail("python-can was asked"))
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
@@ -189,7 +189,7 @@ def test_no_socketcand_server_is_found_out_at_once(monkeypatch: pytest.MonkeyPat
 
 
 def serve(server: socket.socket, answers: tuple[bytes, ...]) -> None:
-    """First a probe, which wants the greeting only, then the client."""
+    """Serve a probe first, which needs the greeting only, then the client."""
     for number in range(2):
         connection, _ = server.accept()
         connection.sendall(answers[0])

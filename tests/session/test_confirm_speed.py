@@ -1,4 +1,4 @@
-"""What the operator is asked at the first slow speed, and what counts as his word."""
+"""Question to the operator at the first slow speed, and accepted answers."""
 
 import errno
 import io
@@ -24,7 +24,7 @@ class Terminal(io.StringIO):
 
 
 def ask(monkeypatch, typed, terminal=True, **options):
-    """What is printed; a cycle goes on while somebody makes up his mind."""
+    """Return the printed text. The cycles continue while the operator decides."""
     monkeypatch.setattr(sys, "stdin", Terminal(typed) if terminal else io.StringIO(typed))
     console, cycles = Console(file=io.StringIO(), width=200), []
     confirm_speed(
@@ -47,20 +47,20 @@ def test_the_main_shaft_is_named_where_a_gear_is(monkeypatch):
 
 
 @pytest.mark.parametrize("typed", ["no\n", "\n", "", "MOVE\n", "yes it is\n", "ja\n"])
-def test_anything_else_is_a_no(monkeypatch, typed):
+def test_any_other_answer_is_a_no(monkeypatch, typed):
     with pytest.raises(PreflightRefused, match="not confirm that the shaft turns forward once every 12 s") as caught:
         ask(monkeypatch, typed)
     assert "speed scaling in the profile" in caught.value.next_step
 
 
-def test_nobody_at_a_terminal_is_no_yes(monkeypatch):
+def test_without_an_answer_at_the_terminal_it_is_a_no(monkeypatch):
     with pytest.raises(PreflightRefused, match="no operator can confirm") as caught:
         ask(monkeypatch, "yes\n", terminal=False)
     assert "--accept-speed-unit" in caught.value.next_step
 
 
 def test_a_program_in_the_background_is_refused_not_stopped(monkeypatch):
-    """SIGTTIN is not heard meanwhile: reading the terminal then fails with EIO."""
+    """SIGTTIN is ignored in this time, so that a read of the terminal fails with EIO."""
     terminal = Terminal()
     terminal.readline = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
     monkeypatch.setattr(sys, "stdin", terminal)
@@ -69,7 +69,7 @@ def test_a_program_in_the_background_is_refused_not_stopped(monkeypatch):
 
 
 def test_a_terminal_that_takes_nothing_holds_no_cycle_up(monkeypatch):
-    """Ctrl-S, a connection that hangs: the shaft turns, and gets its cycles and its stop all the same."""
+    """With Ctrl-S or a blocked connection, cycles and stop continue while the shaft turns."""
     taken, cycles = threading.Event(), []
     stuck = io.StringIO()
     stuck.write = lambda text: taken.wait(5.0) and len(text)
@@ -110,12 +110,12 @@ def test_no_terminal_at_all(monkeypatch):
         confirm_speed(1.0, "", lambda: None, console=Console(file=io.StringIO()), pause_display=lambda: None)
 
 
-def test_a_file_never_says_it():
+def test_no_file_answers_it():
     assert "--accept-speed-unit" in RunSection.never_here["accept_speed_unit"]
 
 
 @pytest.mark.parametrize(("speed_rad_s", "said"), [
     (0.5236, "forward once every 12 s"), (-0.5236, "backwards once every 12 s"), (7.5, "forward 11.9 times in 10 s"),
 ])
-def test_how_a_speed_is_said(speed_rad_s, said):
+def test_words_for_a_speed(speed_rad_s, said):
     assert turns_text(speed_rad_s) == said

@@ -1,4 +1,4 @@
-"""One drive, one holder: among processes, and whatever becomes of the holder."""
+"""One owner per drive: among processes, and after any end of the owner."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def leave_no_files() -> Iterator[None]:
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """One that nobody answers on, and nobody else takes meanwhile."""
+    """Return a reserved port without a server."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         yield taken.getsockname()[1]
@@ -74,7 +74,7 @@ def given(**asked: object) -> str | None:
     return found
 
 
-def test_a_second_process_is_told_who_has_it_and_a_killed_one_has_it_no_more(port):
+def test_a_second_process_is_refused_with_the_owner_and_a_killed_owner_releases_it(port):
     at = address(port)
     assert holder_of(at) is None
     with another_process(at) as process:
@@ -112,7 +112,7 @@ def test_identify_is_refused_while_stop_is_not(port, capsys, tmp_path, monkeypat
     with another_process(address(port)) as process:
         assert main(["identify", *where, "--yes"]) == ExitCode.REFUSED
         assert f"the drive is held by process {process.pid} (" in capsys.readouterr().err
-        # It takes no lock: it fails for want of a drive only.
+        # It takes no lock, and fails only because there is no drive.
         assert main(["stop", *where]) == ExitCode.STOP_NOT_CONFIRMED
         assert "held by" not in capsys.readouterr().err
 
@@ -125,7 +125,7 @@ def test_one_process_has_it_once(port):
 
 
 def test_another_unit_node_or_bus_is_another_drive(port):
-    bus = f"none{port}"                # another one in every run of the tests: the locks are one for all
+    bus = f"none{port}"                # different in every run of the tests, since locks are global
     with hold(address(port)), hold(address(port, unit=7)), hold(given(interface="socketcan", channel=bus, node=3)):
         with hold(given(interface="socketcan", channel=bus, node=4)):
             pass
@@ -145,14 +145,14 @@ def test_one_drive_has_one_address(port, tmp_path):
 @pytest.mark.parametrize("asked", [
     {"simulate": True, "interface": "socketcan", "channel": "can0"}, {}, {"interface": "virtual", "channel": "shared"},
 ])
-def test_what_no_other_process_can_reach_needs_no_lock(asked):
+def test_a_drive_within_the_process_needs_no_lock(asked):
     assert given(**asked) is None
     with hold(None), hold(None):
         pass
 
 
 @pytest.mark.parametrize("text", ["", "[" * 3000, '{"pid": "x"}', '{"pid": 1e999, "command": 1, "since": 2}', "{}"])
-def test_a_file_that_says_nothing_of_its_holder_still_holds(port, text):
+def test_a_lock_file_without_an_owner_still_holds(port, text):
     at = address(port)
     with hold(at):
         drive_lock._path(at).write_text(text)
@@ -175,7 +175,7 @@ def files_open() -> int:
     return sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
-def test_who_holds_a_drive_is_said_by_command_and_is_said_no_more_after_it(port, monkeypatch):
+def test_the_owner_of_a_drive_is_reported_by_command_until_its_end(port, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/some/where/tdhil", "identify", "--note", "two words"])
     at = address(port)
     with hold(at):
@@ -183,7 +183,7 @@ def test_who_holds_a_drive_is_said_by_command_and_is_said_no_more_after_it(port,
     assert drive_lock._path(at).read_bytes() == b""
 
 
-def test_all_holders_of_this_computer_are_listed(port, monkeypatch, tmp_path):
+def test_all_owners_on_this_computer_are_listed(port, monkeypatch, tmp_path):
     tmp_path.chmod(0o1777)
     monkeypatch.setattr(drive_lock, "FOLDERS", (str(tmp_path),))
     assert drive_lock.holders() == []
@@ -195,7 +195,7 @@ def test_all_holders_of_this_computer_are_listed(port, monkeypatch, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts open files in /proc")
-def test_the_file_is_for_every_user_whatever_the_mask_and_is_opened_once(port, monkeypatch, tmp_path):
+def test_the_file_is_for_every_user_with_any_mask_and_is_opened_once(port, monkeypatch, tmp_path):
     tmp_path.chmod(0o1777)
     monkeypatch.setattr(drive_lock, "FOLDERS", (str(tmp_path),))
     at, before, mask = address(port), files_open(), os.umask(0o077)
@@ -208,7 +208,7 @@ def test_the_file_is_for_every_user_whatever_the_mask_and_is_opened_once(port, m
         os.umask(mask)
 
 
-def test_a_file_that_comes_and_goes_and_a_system_without_locks_are_no_motion(port, monkeypatch):
+def test_a_vanishing_file_or_a_system_without_locks_refuses_motion(port, monkeypatch):
     import fcntl
 
     at, real = address(port), os.open
@@ -231,7 +231,7 @@ def test_a_file_that_comes_and_goes_and_a_system_without_locks_are_no_motion(por
         pass
 
 
-def test_a_system_without_such_locks_knows_no_holder(port, monkeypatch):
+def test_a_system_without_such_locks_reports_no_owner(port, monkeypatch):
     at = address(port)
     with hold(at):
         monkeypatch.setattr(sys, "platform", "win32")

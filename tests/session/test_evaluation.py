@@ -1,4 +1,4 @@
-"""An evaluation is concluded from the log alone; of an aborted run only the time before the abort counts."""
+"""Evaluation from the log alone; in an aborted run only the time before the abort counts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.soft_torque.test_evaluation import CASE, PROGRAM, rows
 
 
 @pytest.mark.parametrize(("end_s", "trials"), [(190.0, 2), (110.0, 0)])
-def test_what_follows_an_abort_does_not_count(end_s, trials):
+def test_data_after_an_abort_do_not_count(end_s, trials):
     log = rows(57.0, (60.0, 56.3, 57.2), damping=0.22)
     stages = (Stage("acquire", 8.0, end_s, "aborted", "Interrupted: interrupted by Ctrl-C"),)
     run = RUN | {"evaluation": {"case": CASE.plain(), "program": asdict(PROGRAM)}}

@@ -1,4 +1,4 @@
-"""The connection of a run as plain data: what comes back is what went in, for each profile and each way to a drive."""
+"""Connection of a run as plain data: round trip for each profile and each kind of connection."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def kept(path: Path) -> tuple:
 
 
 @pytest.mark.parametrize("text", WAYS)
-def test_the_way_to_a_drive_comes_back_without_its_files(tmp_path, monkeypatch, text):
+def test_the_connection_to_a_drive_is_restored_without_its_files(tmp_path, monkeypatch, text):
     for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE"):
         monkeypatch.delenv(name, raising=False)
     path = rig_file(tmp_path, text)
     options, connection, plain = kept(path)
     path.unlink()
-    monkeypatch.setenv("CAN_CHANNEL", "can9")              # what the environment says by then doesn't count
+    monkeypatch.setenv("CAN_CHANNEL", "can9")              # a later environment has no effect
     again, back = connection_of_kept(plain)
     assert {name: one.value for name, one in back.line.settings.items()} == {
         name: one.value for name, one in connection.line.settings.items()}
@@ -45,13 +45,13 @@ def test_the_way_to_a_drive_comes_back_without_its_files(tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("name", profile_names())
-def test_a_profile_comes_back_as_it_was(tmp_path, name):
+def test_a_profile_is_restored(tmp_path, name):
     profile = load_profile(name)
     way = {"canopen": CANOPEN, "modbus": WAYS[1], "ethercat": WAYS[-1]}[profile.bus]
     assert connection_of_kept(kept(rig_file(tmp_path, f"profile: {name}\n{way}"))[2])[1].profile == profile
 
 
-def test_a_profile_of_the_user_s_is_kept_as_it_was(tmp_path):
+def test_a_profile_of_the_user_is_kept(tmp_path):
     own = tmp_path / "own.yaml"
     own.write_text(profile_path("generic/modbus").read_text())
     options, connection, plain = kept(rig_file(tmp_path, f"profile: own.yaml\n{WAYS[1]}"))
@@ -63,6 +63,6 @@ def test_a_profile_of_the_user_s_is_kept_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize("plain", [{}, {"drive": "no bus"}, {"drive": "modbus", "profile": "x", "profile_text": "x"}])
-def test_what_is_no_connection_is_refused(plain):
+def test_invalid_connection_data_are_refused(plain):
     with pytest.raises((DataFileError, KeyError, TypeError, ValueError)):
         connection_of_kept(plain)

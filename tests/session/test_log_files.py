@@ -1,4 +1,4 @@
-"""A log whose folder is renamed or removed in mid-run: nothing is lost, and what is said names a file that is there."""
+"""Log whose folder is renamed or removed during a run: no data are lost, and messages name an existing file."""
 
 import os
 import shutil
@@ -26,14 +26,14 @@ def opened(tmp_path):
     place._forget()
 
 
-def test_a_device_is_written_to_as_it_is():
+def test_a_device_is_written_to_directly():
     place = LogPlace(Path(os.devnull))
     with place.open(place.wanted) as file:
         assert file.write(b"what was recorded")
     assert (place.path, place.older, place.live) == (Path(os.devnull), None, False)
 
 
-def test_a_log_that_stays_where_it_is_is_not_looked_for(opened):
+def test_a_log_that_is_not_moved_is_not_searched(opened):
     place, folder = opened
     place.follow()
     assert (place.path, place.moved) == (folder / "run.mcap", "")
@@ -48,7 +48,7 @@ def test_a_folder_that_is_renamed(opened, tmp_path):
     assert place.path.read_bytes() == b"what was recorded"
 
 
-def test_another_file_under_its_name_is_not_taken_for_it(opened, tmp_path):
+def test_another_file_with_its_name_is_not_accepted(opened, tmp_path):
     place, folder = opened
     folder.rename(tmp_path / "elsewhere")
     folder.mkdir()
@@ -94,7 +94,7 @@ def test_without_any_folder_the_error_is_one_of_the_log(opened, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
 
 
-def test_what_can_be_neither_found_nor_saved_is_an_error(opened, monkeypatch):
+def test_a_log_that_can_be_neither_found_nor_saved_is_an_error(opened, monkeypatch):
     place, folder = opened
     shutil.rmtree(folder)
     monkeypatch.setattr(shutil, "copyfileobj", lambda *files: (_ for _ in ()).throw(OSError(28, "full")))
@@ -104,8 +104,8 @@ def test_what_can_be_neither_found_nor_saved_is_an_error(opened, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_a_run_says_where_its_log_is(tmp_path, monkeypatch, capsys):
-    """By the command line, with the folder renamed while the shaft turns."""
+def test_a_run_reports_where_its_log_is(tmp_path, monkeypatch, capsys):
+    """The command line runs, and the folder is renamed while the shaft turns."""
     from tdhil.cli.main import main
     from tdhil.recording.log_reader import read_run
     from tdhil.session.run_session import RunSession

@@ -1,4 +1,4 @@
-"""Where a Modbus drive is: whose word counts, what excludes what, and which bus is meant if nobody says."""
+"""Address of a Modbus drive: precedence of sources, conflicts, and the bus without a statement."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def no_bus_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def chosen(cli: dict[str, Any], rig: Rig | None = None) -> tuple[str, str, str, str]:
-    """(drive, who said so, profile, who said so)."""
+    """Return (drive, its source, profile, its source)."""
     options, connection = connection_of(cli, rig, resolve(cli, rig))
     assert connection.drive == options.drive
     return options.drive, options.source("drive"), options.profile, options.source("profile")
 
 
-def test_nobody_says_where() -> None:
+def test_no_address_is_stated() -> None:
     found = modbus_line({}, None, PROFILE)
     assert found.host is None and found.serial is None
     assert list(found.rows()) == [("unit", "1", "profile generic/modbus")]
@@ -80,7 +80,7 @@ def test_what_is_refused(cli: dict[str, Any], said: str) -> None:
     assert said in str(caught.value)
 
 
-def test_which_bus_is_meant(tmp_path: Path) -> None:
+def test_choice_of_the_bus(tmp_path: Path) -> None:
     assert chosen({}) == ("canopen", "default", "generic/cia402", "default")
     assert chosen({"drive": "modbus"}) == ("modbus", "--drive", "generic/modbus", "default")
     assert chosen({"profile": "generic/modbus"})[:2] == ("modbus", "profile generic/modbus")

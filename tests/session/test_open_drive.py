@@ -1,4 +1,4 @@
-"""Which peer a run has: the embedded simulator, or the drive at its address."""
+"""Peer of a run: the embedded simulator, or the drive at its address."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether this computer sustains a rate by the clock: measured with the drive disabled, and said in words."""
+"""Test of whether this computer sustains a rate in real time: measured with a disabled drive, and reported."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ from tdhil.session import PaceMeasured, connection_of, measure_pace
     (0, True, "sustains 100 cycles per second: 0 of 150"),
     (3, False, "does not sustain 100 cycles per second now: 3 of"),
 ])
-def test_it_is_said_with_its_limit(late, holds, words):
+def test_it_is_reported_with_its_limit(late, holds, words):
     found = PaceMeasured(100.0, 150, late, 0.012)
     assert found.holds is holds
     assert words in found.text and "half a period (5 ms)" in found.text and "12 ms" in found.text
@@ -21,7 +21,7 @@ def test_it_is_said_with_its_limit(late, holds, words):
 
 
 @pytest.mark.parametrize(("cycle_s", "late"), [(0.010, 0), (0.014, 0), (0.016, 150)])
-def test_a_drive_that_tells_no_delay_is_timed_from_cycle_to_cycle(monkeypatch, cycle_s, late):
+def test_a_drive_without_delays_is_timed_from_cycle_to_cycle(monkeypatch, cycle_s, late):
     clock = SimpleNamespace(now_s=5.0)
 
     def exchange(_command: object) -> None:

@@ -1,4 +1,4 @@
-"""Real-time priority: of one thread, where it is allowed, said where it isn't, and given back."""
+"""Real-time priority of one thread: set if allowed, reported if not, and restored."""
 
 import ctypes
 import errno
@@ -46,7 +46,7 @@ def test_only_this_thread_is_raised_and_it_is_lowered_again():
 def test_a_loop_that_never_pauses_loses_its_priority(monkeypatch):
     if real_time.allowed()[0]:
         pytest.skip(f"not allowed here: {real_time.allowed()[0]}")
-    monkeypatch.setattr(real_time, "MOST_CPU_S", 0.05)      # a second would stop whatever else runs on this core
+    monkeypatch.setattr(real_time, "MOST_CPU_S", 0.05)      # a whole second would stop all other programs on this core
     usual = signal.getsignal(signal.SIGXCPU)
     try:
         with real_time_priority(True):
@@ -59,7 +59,7 @@ def test_a_loop_that_never_pauses_loses_its_priority(monkeypatch):
 
 
 @linux
-def test_where_it_is_not_allowed_the_run_goes_on_and_is_told_how(monkeypatch):
+def test_without_permission_the_run_continues_with_advice(monkeypatch):
     def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 
@@ -76,7 +76,7 @@ def test_where_it_is_not_allowed_the_run_goes_on_and_is_told_how(monkeypatch):
 
 
 @linux
-def test_memory_that_the_system_does_not_lock_is_told_with_its_reason(monkeypatch):
+def test_memory_that_cannot_be_locked_is_reported_with_its_reason(monkeypatch):
     def refuse(_flags: int) -> int:
         ctypes.set_errno(errno.ENOMEM)
         return -1
@@ -88,7 +88,7 @@ def test_memory_that_the_system_does_not_lock_is_told_with_its_reason(monkeypatc
         assert "memory not locked: Cannot allocate memory" in raised.said
 
 
-def test_nobody_asked_or_stepped_time():
+def test_without_a_request_or_in_stepped_time():
     with real_time_priority(False) as raised:
         assert raised.said == ""
     with real_time_priority(True, stepped=True) as raised:

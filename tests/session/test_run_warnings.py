@@ -1,4 +1,4 @@
-"""Warnings of the run itself stand beside each kind of result, not only beside that of an identification."""
+"""Warnings of the run itself: they are in each kind of result, not only in an identification."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EVALUATED = {"evaluation": {"case": STRING_CASE.plain(), "program": asdict(STRIN
 
 
 @pytest.mark.parametrize("kind", [VERIFIED, EVALUATED], ids=["verification", "evaluation"])
-def test_a_stop_that_was_not_confirmed_and_another_master_stand_beside_the_verdict(kind):
+def test_an_unconfirmed_stop_and_another_master_are_beside_the_verdict(kind):
     string = rows(57.0, (57.5,))
     document = conclude_run(recording(), WARNED | kind, "run.mcap", string).document
     assert [STOP in document["warnings"][0], MASTER in document["warnings"][1]] == [True, True]

@@ -1,4 +1,4 @@
-"""Overrides of what a profile only supposes: by name, all that is likely at once, and never by a typo."""
+"""Overrides of unverified profile entries: by name, all likely ones together, and never by a misspelt option."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = [name for name, _ in PLAIN.entries()]
 
 
 def with_confidence(doubts: dict[str, Confidence]) -> ModbusProfile:
-    """generic/modbus, some of whose entries are less sure."""
+    """Return generic/modbus with some less certain entries."""
 
     def changed(name: str, part: object) -> object:
         if name not in doubts:
@@ -46,7 +46,7 @@ ACCEPTED = st.sets(st.sampled_from([*NAMES, "likely", "cycle", "parameters", "fi
 
 
 @given(doubts=DOUBTS, accepted=ACCEPTED)
-def test_refused_is_just_what_nobody_took(doubts: dict[str, Confidence], accepted: set[str]) -> None:
+def test_only_entries_without_an_override_are_refused(doubts: dict[str, Confidence], accepted: set[str]) -> None:
     profile = with_confidence(doubts)
     assert {name: entry.confidence for name, entry in doubtful(profile)} == doubts
     wanted = {
@@ -59,7 +59,7 @@ def test_refused_is_just_what_nobody_took(doubts: dict[str, Confidence], accepte
     except PreflightRefused as error:
         lines = [line for line in error.what.split("\n") if line.startswith("  ")]
         refused = {line.split()[0] for line in lines}
-        # What it proposes is enough, and names whatever is unverified by its own name.
+        # The proposed options are sufficient and name each unverified entry.
         words = error.next_step.split("--accept-unverified ")[1:]
         require_accepted(profile, {*accepted, *(word.split()[0] for word in words)})
     assert refused == wanted
@@ -94,6 +94,6 @@ def test_every_entry_of_every_profile_can_be_named(name: str) -> None:
 
 
 @pytest.mark.parametrize("short", ["--ye", "--accept-no", "--reset"])
-def test_no_beginning_of_an_option_is_taken_for_it(short: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_abbreviated_option_is_not_accepted(short: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["identify", "--simulate", short]) == 2
     assert short in capsys.readouterr().err

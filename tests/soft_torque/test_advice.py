@@ -57,7 +57,7 @@ def row(kind, cure_rpm, failed=(), spread=0.02):
 @pytest.mark.parametrize(("rows", "kind"), [
     ((row("present", 51.3), row("stiff", 150.0), row("soft", 40.0), row("compensated", 39.0)), "soft"),
     ((row("present", 51.3), row("stiff", 150.0), row("soft", 50.0), row("compensated", 39.0)), "compensated"),
-    # the soft one is within the resolution of the best one, and the best one alone is clearly better than present
+    # the soft row is within the resolution of the best row; only the best row is clearly better than the present one
     ((row("present", 51.3), row("stiff", 150.0), row("soft", 49.1), row("compensated", 47.2)), "compensated"),
     ((row("present", 51.3), row("stiff", 150.0), row("soft", 50.0), row("compensated", 49.0)), None),
     ((row("present", 51.3), row("stiff", 150.0), row("soft", 60.0), row("compensated", 70.0)), None),
@@ -194,17 +194,17 @@ def test_the_turning_point_of_a_kink_is_found():
     assert one.damping.low <= min(along) + 1e-3
 
 
-def test_an_interval_of_draws_says_where_its_end_is_not_known():
+def test_an_interval_of_draws_marks_an_unknown_end():
     low, high = DrawnValues((50.0, 60.0, inf)).interval()
     assert low <= 50.0 and high is None
     assert DrawnValues((inf, inf)).median is None
-    low, high = DrawnValues((8.0, 8.0, 8.1), 10.0).interval()      # no lower set speed was tried
+    low, high = DrawnValues((8.0, 8.0, 8.1), 10.0).interval()      # no lower set speed was tested
     assert (low, high) == (0.0, 10.0)
 
 
 @pytest.mark.heavy
 def test_the_map_contains_the_friction_of_a_deviated_well():
-    """Side force along the string makes no cell safer, and under stiff gains some stuck bit no longer comes free."""
+    """Side force along the string makes no cell safer. With stiff gains, a stuck bit in some cells is not freed."""
     order = ("stick-slip", "at risk", "stable")
 
     def states(side_force_n_m):

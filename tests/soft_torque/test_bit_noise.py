@@ -64,7 +64,7 @@ def part(whole: SurfaceRecord, end_s: float) -> SurfaceRecord:
     (200.0, 0.2, 2), pytest.param(200.0, 0.2, 30, marks=pytest.mark.heavy),
     pytest.param(600.0, 0.5, 30, marks=pytest.mark.heavy), pytest.param(1000.0, 0.1, 30, marks=pytest.mark.long),
 ])
-def test_the_interval_holds_the_noise_that_acted(rms_nm, correlation_s, seeds):
+def test_the_interval_contains_the_true_noise(rms_nm, correlation_s, seeds):
     case = drilled(rms_nm, correlation_s, seeds)
     found = [bit_noise_in(record(case, seed), EXACT, EXACT_J) for seed in range(seeds)]
     # If θ is held, σ is that of the stated θ with the same density at the lowest mode of 0.13 Hz.
@@ -79,7 +79,7 @@ def test_the_interval_holds_the_noise_that_acted(rms_nm, correlation_s, seeds):
     assert np.mean(inside) >= 0.9
     assert np.median([one.rms_nm.value / rms for one, rms in zip(found, expected, strict=True)]) == pytest.approx(
         1.0, rel=0.12)
-    # the density at low frequency, 4σ²θ, is what moves the lowest mode
+    # the density at low frequency, 4σ²θ, excites the lowest mode
     density = [one.rms_nm.value**2 * one.correlation_s.value for one in found]
     assert np.median(density) == pytest.approx(rms_nm**2 * correlation_s, rel=0.2)
 
@@ -94,7 +94,7 @@ def test_string_and_inertia_widen_the_interval():
     assert 0.0 < wide.report_share < 0.1 and wide.segments >= 20
 
 
-def test_what_does_not_hold_it_is_refused_in_words():
+def test_unsuitable_records_are_refused_with_a_reason():
     case = drilled(200.0, 0.2, 2)
     whole = record(case, 0)
     with pytest.raises(SeverityRefused, match=r"has 3 segments of steady rotation; .* needs 8, which is 208 s"):
@@ -112,7 +112,7 @@ def test_what_does_not_hold_it_is_refused_in_words():
         bit_noise_in(record(sticks, 0), STRING, INERTIA)
 
 
-def test_the_tuning_takes_it_with_its_interval():
+def test_the_tuning_uses_it_with_its_interval():
     string = with_noise(STRING, Interval(300.0, 200.0, 400.0), 0.4)
     assert (string.bit.noise_nm, string.bit.noise_correlation_s) == (300.0, 0.4)
     assert string.tolerance.noise_factor == pytest.approx(1.5)

@@ -23,7 +23,7 @@ from tests.soft_torque.cases import DRIVE, HALF, STRING, TABLE, Pipe, chain_mode
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_poles_of_the_whole_are_those_of_the_chain(name):
+def test_poles_of_the_whole_loop_are_those_of_the_chain(name):
     a, _, _ = lumped_chain([Pipe(3000.0, 0.127, 0.1086, lumps=100)], 374.0, 20.0, DRIVE, TABLE[name])
     chain = [one for one in chain_modes(a, 1.2) if one[1] < 0.97]
     exact = ClosedSystem(STRING, DRIVE, TABLE[name]).modes(1.2)
@@ -62,7 +62,7 @@ def test_the_stiff_controller_has_the_margin_that_it_states():
         stiff_controller(DRIVE, 178.0)
 
 
-def test_tuned_gains_match_where_they_say():
+def test_tuned_gains_match_at_the_stated_frequency():
     """Without inner lags and with B = 0, r = (1 − a)/(1 + a) at the mode."""
     bare = TopDrive(1500.0)
     for softness in (0.2, 1.0, 1.7):
@@ -71,7 +71,7 @@ def test_tuned_gains_match_where_they_say():
         assert found == pytest.approx(abs(1.0 - softness) / (1.0 + softness), abs=1e-9)
 
 
-def test_softer_than_allowed_feeds_slow_swings():
+def test_softer_than_allowed_drives_slow_oscillations():
     """Re Z(jω → 0) changes its sign at the returned a."""
     drive = TopDrive(1500.0, 0.0, 0.0, (0.2, 0.15))
     most = softest_allowed(STRING, drive, 0.1299)
@@ -129,6 +129,6 @@ def test_two_roots_at_one_place_count_twice():
     assert found == pytest.approx([0.3 + 0.2j] * 2, abs=1e-3)
 
 
-def test_a_path_through_a_root_is_told():
+def test_a_path_through_a_root_is_reported():
     with pytest.raises(RootsLost):
         count_in(lambda s: s, 0.0, 1.0 + 1.0j, 0.1)

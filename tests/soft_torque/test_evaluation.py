@@ -50,12 +50,12 @@ def test_what_can_not_be_true_is_refused(case, period_s, said):
 
 
 @pytest.mark.parametrize(("law", "period_s"), [(SOFT_025, 0.05), (SOFT_025, 0.01), (STIFF, 0.02), (STIFF, 0.01)])
-def test_what_can_be_true_is_not(law, period_s):
+def test_possible_values_are_accepted(law, period_s):
     check_virtual_string(replace(CASE, law=law), period_s)
 
 
 @pytest.mark.heavy
-def test_the_course_is_laid_where_the_shaft_can_bear_it():
+def test_the_program_stays_within_the_limits_of_the_shaft():
     program = program_for(CASE, WINDOW)
     assert program.start_rad_s == pytest.approx(44.0 * RPM)
     assert program.highest_rad_s == pytest.approx(79.0 * RPM)
@@ -77,13 +77,13 @@ def test_a_window_without_room_is_refused(window, said):
         program_for(CASE, window)
 
 
-def test_a_case_comes_back_from_json():
+def test_a_case_survives_a_round_trip_by_json():
     smooth = replace(CASE, string=string_with(friction="coulomb", static_nm=None, stribeck_speed_rad_s=None))
     for case in (CASE, smooth, replace(CASE, own_loop=True)):
         assert case_of(json.loads(json.dumps(case.plain(), allow_nan=False))) == case
 
 
-def test_the_log_keeps_what_the_loop_tells():
+def test_the_log_keeps_the_data_of_the_loop():
     assert VIRTUAL_COLUMNS == COLUMNS
 
 
@@ -124,8 +124,8 @@ def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
 @pytest.mark.long(but_first=3)
 @pytest.mark.heavy
 @pytest.mark.parametrize("seed", range(8))
-def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
-    # Modes of a = 0.25 in the reference case, with the noise that the loop's own disturbances leave in the speed.
+def test_two_similar_modes_are_distinguished_in_noise(seed):
+    # Modes of a = 0.25 in the reference case, with the noise of the speed from the disturbances of the loop.
     table = rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2))
     released = table[:, COLUMNS.index("phase")] == Phase.RELEASED
     time_s = 0.1 * np.arange(released.sum())
@@ -139,7 +139,7 @@ def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
     assert found.outcome is EvaluationOutcome.AS_PREDICTED
 
 
-def test_critical_speed_and_damping_are_read_off_the_rows():
+def test_critical_speed_and_damping_are_found_from_the_rows():
     found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.15), CASE, PROGRAM)
     assert found.outcome is EvaluationOutcome.DIFFERS                   # the damping ratio is 0.15
     assert "damping" in found.why
@@ -196,7 +196,7 @@ def decaying(damping, noise, seed):
 
 @pytest.mark.parametrize("seeds", [pytest.param(3, marks=pytest.mark.heavy), pytest.param(10, marks=pytest.mark.long)])
 def test_the_damping_of_a_noisy_decay_lies_in_its_interval(seeds):
-    """In noise of several sizes, 93 % of the intervals cover the truth, and at most one verdict is `differs`."""
+    """Intervals with noise of several sizes cover the truth in 93 % of the cases; at most one verdict is `differs`."""
     found = [evaluate(decaying(0.226, noise, seed), CASE, PROGRAM)
              for noise in (0.01, 0.05, 0.15) for seed in range(seeds)]
     inside = [one.damping_interval.low <= 0.226 <= one.damping_interval.high for one in found]
@@ -216,7 +216,7 @@ def test_unknown_torque_widens_the_interval():
 def test_the_torque_of_the_highest_set_speed_counts_before_motion():
     """A torque limit that only the end of the ramp would exceed is refused before motion."""
     program = program_for(CASE, WINDOW)
-    for share in (1.1, 1.35):              # 1.35: without the highest set speed there would be room
+    for share in (1.1, 1.35):              # with 1.35 it would fit without the highest set speed
         with pytest.raises(EvaluationRefused, match="would be cut off"):
             program_for(CASE, replace(WINDOW, torque_nm=share * program.peak_nm))
 
@@ -232,7 +232,7 @@ def test_trials_are_long_enough_for_slow_stick_slip():
 
 @pytest.mark.heavy
 def test_the_unknown_torque_widens_the_predicted_critical_speed():
-    """A bench of 32 kg·m²: disturbances of 106 N·m rms at the main shaft let the bit turn from 39 rpm on, at times."""
+    """On a bench of 32 kg·m², disturbances of 106 N·m rms at the main shaft sometimes free the bit from 39 rpm on."""
     law = SpeedController(738.3, 638.5)
     predicted = replace(PREDICTED, cure_rpm=Interval(52.5, 51.6, 53.4), least_damping=Interval(0.120, 0.114, 0.127))
     case, program = replace(CASE, law=law, prediction=predicted), SpeedProgram(44.0 * RPM, 74.0 * RPM)

@@ -35,7 +35,7 @@ def scheduled():
     return schedule(CASE, DEPTHS_M, "soft", simulated=False)
 
 
-def test_the_topmost_section_takes_the_depth():
+def test_the_topmost_section_gets_the_change_of_depth():
     assert at_depth(STRING, 1200.0).lines[0].length_m == 1200.0
     collars = replace(STRING, lines=(STRING.lines[0], replace(STRING.lines[0], length_m=200.0)))
     assert [line.length_m for line in at_depth(collars, 1000.0).lines] == [800.0, 200.0]
@@ -44,8 +44,8 @@ def test_the_topmost_section_takes_the_depth():
 
 
 @pytest.mark.heavy
-def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
-    """At the stated length, the row has the gains of `tune`. With depth, the integral gain and the mode decrease."""
+def test_a_row_equals_the_tuning_at_that_depth(scheduled):
+    """The row at the stated length has the gains of `tune`. Integral gain and mode decrease with depth."""
     alone = tune(CASE, search=None).by_kind("soft").controller
     assert scheduled.rows[-1].controller == alone
     gains = [row.controller.integral_nm_rad for row in scheduled.rows]
@@ -54,7 +54,7 @@ def test_a_row_is_what_tuning_at_that_depth_gives(scheduled):
 
 
 @pytest.mark.heavy
-def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
+def test_rows_keep_the_margins_and_interpolated_gains_are_checked(scheduled):
     """Interpolated gains are the mean of both neighbours. Their margins are those of `loop_margins` on each truth."""
     assert not any(row.failed for row in scheduled.rows)
     assert [row.depth_m for row in scheduled.between] == [1875.0, 2625.0]
@@ -68,8 +68,8 @@ def test_rows_keep_the_margins_and_what_lies_between_is_measured(scheduled):
 
 
 @pytest.mark.heavy
-def test_critical_speeds_stand_beside_those_of_the_present_gains():
-    """At 1,500 m, the row has a lower critical speed than the present gains of the rig."""
+def test_critical_speeds_are_beside_those_of_the_present_gains():
+    """The row at 1,500 m has a lower critical speed than the present gains of the rig."""
     case = replace(CASE, present=SpeedController(4000.0, 3000.0), draws=6)
     (row,) = schedule(case, (1500.0,), "soft").rows
     assert row.cure.median < row.compared.median
@@ -103,7 +103,7 @@ def test_the_sentence_states_the_worst_case_between_the_depths():
 
 
 @pytest.mark.heavy
-def test_a_depth_at_which_nothing_keeps_the_margins_says_so():
+def test_a_depth_without_gains_that_keep_the_margins_is_reported():
     strict = replace(CASE, required=RequiredMargins(89.0, 30.0, 1.0))
     found = schedule(strict, (1500.0, 3000.0), "soft", simulated=False)
     assert [row.controller for row in found.rows] == [None, None]

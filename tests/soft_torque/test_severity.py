@@ -38,7 +38,7 @@ def gains(law: SpeedController):
 
 @pytest.fixture(scope="module")
 def drilled():
-    """Simulated records by gains and set speed, rpm: (record as reported, true speed of the bit)."""
+    """Return simulated records by gains and set speed, rpm: (reported record, true speed of the bit)."""
     rpm = np.array([[100.0, 180.0], [100.0, 180.0]])
     time_s, torque, top, bit = recorded(**reference_case(
         laws=[gains(PAPER), gains(SOFT_035)], rpm=rpm, periods=20.0, lumps=14, own_noise=True))
@@ -54,7 +54,7 @@ def late(record: SurfaceRecord, begin_s: float) -> SurfaceRecord:
 
 
 @pytest.mark.heavy
-def test_stick_slip_is_found_at_once_with_its_frequency_and_downhole_swing(drilled):
+def test_stick_slip_is_found_at_once_with_its_frequency_and_downhole_amplitude(drilled):
     record, bit = drilled["paper", 100]
     found = severity(record, EXACT, INERTIA)
     assert found.level == "stick-slip"
@@ -113,7 +113,7 @@ def test_the_reflection_is_that_of_the_gains_in_place(drilled):
 
 
 @pytest.mark.heavy
-def test_what_says_nothing_is_refused(drilled):
+def test_a_record_without_information_is_refused(drilled):
     record, _ = drilled["soft", 180]
     with pytest.raises(SeverityRefused, match="does not turn"):
         severity(replace(record, speed_rad_s=0.0 * record.speed_rad_s), STRING, INERTIA)

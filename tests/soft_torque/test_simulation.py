@@ -64,7 +64,7 @@ def turning(string, law, *, drive=DRIVE, speed=10.0, change=0.5, seconds=40.0, k
     return simulate(string, [(drive, law)], Begin("turning", start), start + change, 1e9, seconds, keep, tick)
 
 
-def test_echoes_come_back_after_twice_the_way():
+def test_echoes_return_after_the_round_trip_time():
     """After a jump of the set speed, the torque is that of a damper ζ until the echo. Its time is exact to 0.005 s."""
     string = string_with(**SMOOTH, viscous_nm_s_rad=0.0, drag=0.0)
     stiff = SpeedController(3e6, 3e6)
@@ -82,7 +82,7 @@ def test_echoes_come_back_after_twice_the_way():
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("hertz", [0.1299, 0.567])
-def test_what_the_top_sends_back_is_what_theory_says(hertz):
+def test_the_reflection_of_the_top_agrees_with_theory(hertz):
     """A sine wave that arrives at the top is reflected with the amplitude of theory, to 0.005."""
     drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
     grid = grid_of(string_with(drag=0.0))
@@ -160,7 +160,7 @@ def test_sections_in_time_against_the_chain(law):
 
 
 @pytest.mark.heavy
-def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says():
+def test_a_bit_sticks_and_breaks_away_as_in_an_event_based_integration():
     """An inertia on a short, stiff line under a ramp breaks away at F_s and then follows the differential equation."""
     from scipy.integrate import solve_ivp
 
@@ -246,7 +246,7 @@ def test_a_bit_that_sticks_again_after_a_minute_does_not_turn():
 
 @pytest.mark.heavy
 def test_slow_stick_slip_against_the_chain():
-    """With and without noise, the cure speed of a loop with a long integral time is that of the chain of masses."""
+    """With and without noise, the cure speed of a loop with a long integral time agrees with the chain of masses."""
     for noise_nm in (0.0, 200.0):
         string = replace(STRING, bit=replace(STRING.bit, noise_nm=noise_nm))
         (found,) = lowest_turning_with_noise([string], [(LIGHT, SLOW)], [1], "stuck", 7.7)
@@ -288,9 +288,11 @@ def rubbing(string, lines):
 
 @pytest.mark.parametrize(("outer_m", "lines", "at_once"), [(None, 0, False), (None, 1, False), (0.203, 0, True),
                                                            (0.203, 1, True), (0.203, 2, False), (0.127, 0, False)])
-def test_ticks_that_are_simulated_together_are_those_of_one_by_one(outer_m, lines, at_once, monkeypatch):
-    """Heavy and light bits, walls that rub, a bit that jumps: equal to the last digit. A light bit's balance is found
-    at once for all ticks, unless it depends on the tick before.
+def test_ticks_that_are_simulated_together_equal_single_ones(outer_m, lines, at_once, monkeypatch):
+    """Heavy and light bits, wall friction, a bit that jumps: all results are equal to the last digit.
+
+    The balance of a light bit is solved for all ticks at once, unless it depends on the tick before.
+
     """
     string = rubbing(STRING if outer_m is None else above_collars(1500.0, 180.0, outer_m), lines)
     loops, speeds = [(DRIVE, SOFT_025), (DRIVE, STIFF)], np.array([[20.0, 60.0, 110.0], [30.0, 90.0, 150.0]]) * RPM
@@ -314,8 +316,8 @@ def test_ticks_that_are_simulated_together_are_those_of_one_by_one(outer_m, line
     assert 0.02 < np.mean(np.array(bits) == 0.0) < 0.98
 
 
-def test_gains_whose_stick_slip_may_be_too_slow_are_told():
-    """Beyond eight periods of the string, the critical speeds may be too low: present gains without integral action."""
+def test_gains_whose_stick_slip_may_be_too_slow_are_reported():
+    """Beyond eight periods of the string, as with gains without integral action, the critical speeds may be too low."""
     shown = {}
     for integral in (1600.0 / 60.0, 1600.0 / 63.0, 0.0):
         present = Tuned("present", SpeedController(1600.0, integral), reflection=J, band_reflection=J, damping=J,
@@ -386,7 +388,7 @@ def test_without_a_bit_there_are_no_critical_speeds():
 
 @pytest.mark.heavy
 def test_a_stuck_bit_that_is_not_freed_stays_stuck():
-    """If the bit does not break away at any speed that is tried, the critical speed is None."""
+    """If the bit does not break away at any tested speed, the critical speed is None."""
     string = string_with(static_nm=1e6, coulomb_nm=1e6)
     search = Search(lowest_rpm=10.0, highest_rpm=20.0, duration_s=20.0, calm_s=5.0, start_ramp_rpm_s=50.0)
     assert lowest_turning(string, [(DRIVE, SOFT_025)], "rest", search) == [None]
@@ -402,7 +404,7 @@ def test_steady_rotation_stays_steady():
 
 @pytest.mark.heavy
 def test_dry_friction_along_the_string_against_the_chain():
-    """In a deviated well with 1,500 N·m of dry wall friction, cure speeds agree with the chain of masses to 5 %."""
+    """Cure speeds in a deviated well with 1,500 N·m of dry wall friction agree with the chain of masses to 5 %."""
     line = replace(STRING.lines[0], coulomb_nm_m=0.5, static_nm_m=0.5)
     string = replace(STRING, lines=(line,), bit=replace(STRING.bit, noise_nm=0.0))
     laws = (SOFT_025, HALF)
@@ -416,7 +418,7 @@ def test_dry_friction_along_the_string_against_the_chain():
     assert found == pytest.approx(expected, rel=0.05)
 
 
-def test_a_string_on_the_wall_holds_what_it_was_wound_up_to():
+def test_a_string_on_the_wall_keeps_its_twist():
     """The side force in the file gives dry friction per metre. Steady rotation needs its torque at the top."""
     from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
@@ -429,12 +431,12 @@ def test_a_string_on_the_wall_holds_what_it_was_wound_up_to():
     assert np.ptp(trace.bit_rad_s) < 1e-6 * 120.0 * RPM
     friction_nm = 2000.0 * string.lines[0].coulomb_nm_m
     free = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 1.0, 0.5)
-    drag_nm = 5.0 * 120.0 * RPM      # drag of 1,000 m, by which this string is shorter than the reference case
+    drag_nm = 5.0 * 120.0 * RPM      # drag of 1,000 m: this string is shorter than the reference case by this length
     assert trace.top_torque_nm[0, 0, 0] - free.top_torque_nm[0, 0, 0] == pytest.approx(friction_nm - drag_nm, rel=0.01)
 
 
 def test_a_torque_on_the_rotor_is_balanced_by_the_drive():
-    """At rest in the end, the drive's torque changes by the disturbance. A record repeats after its last sample."""
+    """The drive's torque at the final standstill has changed by the disturbance. A record repeats after its end."""
     start = np.array([[10.0]])
     quiet, pushed = (
         simulate(string_with(**SMOOTH), [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 40.0,

@@ -164,7 +164,7 @@ def test_unstable_loops_have_no_margin():
 
 
 def test_whether_a_loop_is_stable_needs_no_response_with_a_stuck_bit(monkeypatch):
-    """The response of a stuck bit is computed once, and only if its margins are asked for."""
+    """The response of a stuck bit is computed once, and only if its margins are requested."""
     asked = []
     original = DrillString.at_top
 

@@ -70,13 +70,13 @@ def test_a_file_is_read_from_the_top_down(tmp_path):
     ("friction: stribeck", "friction: coulomb", 9, "belongs to friction: stribeck"),
     ("length_m: 200,", "length_m: 200 m,", 4, "write the number alone, in metres"),
 ])
-def test_mistakes_are_named_with_their_line(tmp_path, old, new, line, words):
+def test_errors_are_reported_with_their_line(tmp_path, old, new, line, words):
     with pytest.raises(DataFileError) as caught:
         load_string(written(tmp_path, GOOD.replace(old, new)))
     assert any(problem.line == line and words in str(problem) for problem in caught.value.problems), caught.value
 
 
-def test_an_entry_that_is_wrong_is_not_called_missing(tmp_path):
+def test_a_wrong_entry_is_not_reported_as_missing(tmp_path):
     one = "sections:\n  - {length_m: 9 km, outer_diameter_m: 0.1, inner_diameter_m: 0}\nbottom: {inertia_kg_m2: 9}\n"
     for text, short in ((one, False), ("sections: []\nbottom: {inertia_kg_m2: 9}\n", True)):
         with pytest.raises(DataFileError) as caught:
@@ -157,7 +157,7 @@ def test_cutting_a_section_changes_nothing():
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(1.0, 4000.0), st.floats(0.08, 0.3), st.floats(0.0, 0.7), st.floats(0.0, 0.05)),
                 min_size=1, max_size=4), st.floats(1.0, 5000.0), st.floats(0.0, 100.0))
-def test_every_string_takes_energy_and_gives_none(sections, inertia, viscous):
+def test_every_string_is_passive(sections, inertia, viscous):
     """The impedance Z_s is positive real: Re Z_s ≥ 0 in the right half-plane, and Z_s(s*) = Z_s(s)*."""
     lines = []
     for length, outer, bore, drag in sections:
@@ -170,7 +170,7 @@ def test_every_string_takes_energy_and_gives_none(sections, inertia, viscous):
     assert np.conj(string.impedance_at(np.conj(s))) == pytest.approx(seen)
 
 
-def test_a_spring_and_a_mass_as_identified_swing_as_they_were_seen_to():
+def test_an_identified_spring_and_mass_have_the_identified_frequency():
     string = spring_and_mass(314.0, 0.1299)
     assert string.stiffness_nm_rad == pytest.approx(314.0)
     first, second, *_ = string_modes_hz(string)
@@ -199,7 +199,7 @@ def drawn(**tolerance):
 
 
 def ratio(outer, inner):
-    """Polar moment of area of 5 inch pipe with changed diameters, divided by that of the stated ones."""
+    """Return the polar moment of area of 5 inch pipe with changed diameters, relative to the stated ones."""
     return ((0.127 * outer)**4 - (0.1086 * inner)**4) / (0.127**4 - 0.1086**4)
 
 
@@ -211,7 +211,7 @@ def ratio(outer, inner):
     ({"wall_friction": 0.5}, 2, 1.0 / 1.5, 1.5),
 ])
 def test_diameters_collars_and_wall_friction_are_drawn_over_their_tolerances(tolerance, moved, low, high):
-    """Each tolerance moves its own property over its whole range, and no other one."""
+    """Each tolerance varies its own property over its whole range, and no other one."""
     found = drawn(**tolerance)
     assert low <= found[moved].min() < low + 0.02 * (high - low) and high - 0.02 * (high - low) < found[moved].max()
     assert found[moved].max() <= high

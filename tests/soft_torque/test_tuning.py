@@ -55,8 +55,8 @@ def test_gains_that_no_search_can_judge_are_not_offered():
 
 
 @pytest.mark.heavy
-def test_what_is_chosen_ranks_best_of_all_that_keep_the_margins(tuned):
-    """No gains of a finer grid that keep every margin on every truth have an estimated critical speed 5 % lower."""
+def test_the_choice_ranks_best_of_all_gains_that_keep_the_margins(tuned):
+    """Gains of a finer grid that keep every margin on every truth do not have a critical speed 5 % lower."""
     own = case()
     truths = own.truths()
 
@@ -76,7 +76,7 @@ def test_each_is_better_damped_than_the_stiff_one(tuned):
     assert 3.0 * tuned["stiff"].damping.value < min(tuned[kind].damping.value for kind in ("soft", "compensated"))
 
 
-def test_gains_are_what_the_recipe_says(tuned):
+def test_gains_follow_the_recipe(tuned):
     soft, compensated = tuned["soft"].controller, tuned["compensated"]
     omega = 2.0 * np.pi * HELD[0] * tuned["soft"].frequency_factor
     assert soft.gain_nm_s_rad == pytest.approx(STRING.impedance_nm_s_rad / tuned["soft"].softness)
@@ -106,7 +106,7 @@ def test_the_reserve_is_kept_at_the_softness_that_is_chosen():
     assert one.lag_reserve_s is None or one.lag_reserve_s > 0.01
 
 
-def test_a_wider_interval_leaves_less_to_compensate():
+def test_a_wider_interval_permits_less_compensation():
     shares = [largest_stable_share(case(Interval(1500.0, 1500.0 * (1 - e), 1500.0 * (1 + e))), 0.3, HELD)
               for e in (0.0, 0.1, 0.3)]
     assert shares[0] > shares[1] > shares[2]
@@ -114,7 +114,7 @@ def test_a_wider_interval_leaves_less_to_compensate():
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["stiff", "soft", "compensated"])
-def test_intervals_are_what_two_hundred_draws_of_j_give(tuned, kind):
+def test_intervals_agree_with_two_hundred_draws_of_j(tuned, kind):
     """The intervals contain 95 % of the draws, and are not wider than the range of the draws."""
     rng = np.random.default_rng(11)
     drawn = rng.normal(1500.0, 60.0 / 1.959964, 200)
@@ -141,7 +141,7 @@ def measured_lags(along=(0.0, 0.0)):
 @pytest.mark.parametrize("kind", [
     "soft", *(pytest.param(one, marks=pytest.mark.heavy) for one in ("present", "compensated")),
 ])
-def test_measured_lags_and_gains_go_in_as_two_hundred_draws_of_all_of_them_do(kind):
+def test_intervals_with_measured_lags_and_gains_agree_with_two_hundred_draws(kind):
     """The intervals contain 95 % of the draws of J, of both correlated lags and of the present gains."""
     gain, integral = (1500.0, 1600.0, 1700.0), (900.0, 1000.0, 1100.0)
 
@@ -167,12 +167,12 @@ def test_measured_lags_and_gains_go_in_as_two_hundred_draws_of_all_of_them_do(ki
         assert 0.91 <= inside <= 0.995
 
 
-def test_lags_that_are_known_badly_leave_less_to_compensate():
+def test_uncertain_lags_permit_less_compensation():
     longer = (Moved(inner_lags_s=(0.005,)), Moved(inner_lags_s=(0.08, 0.03)))
     assert largest_stable_share(case(also=(longer,)), 0.3, HELD) < largest_stable_share(case(), 0.3, HELD) - 0.05
 
 
-def test_a_mode_that_goes_up_is_still_the_lowest():
+def test_a_rising_mode_still_counts_as_the_lowest():
     """With a light rotor and compensation, the lowest mode rises towards the second one and still counts as lowest."""
     drive = TopDrive(104.0, 8.0, 60.0, DRIVE.inner_lags_s)
     law = tuned_controller(STRING, 104.0, 0.936, HELD[0], 0.26)
@@ -182,7 +182,7 @@ def test_a_mode_that_goes_up_is_still_the_lowest():
 
 @pytest.mark.long
 @pytest.mark.heavy
-def test_the_cure_speed_over_the_interval_is_what_two_hundred_draws_of_j_give(tuned):
+def test_the_cure_speed_over_the_interval_agrees_with_two_hundred_draws_of_j(tuned):
     """The cure speeds at the ends of J's interval enclose 95 % of the simulated draws, to the resolution of 1 rpm."""
     rng = np.random.default_rng(12)
     drawn = rng.normal(1500.0, 60.0 / 1.959964, 200)
@@ -209,7 +209,7 @@ def test_more_compensation_than_the_interval_allows_is_refused_with_its_numbers(
     tune(case(compensated_share=0.5, required=NO_MARGINS), search=None)      # accepted if the interval of J is narrow
 
 
-def test_where_nothing_soft_is_stable_it_is_refused_in_words():
+def test_without_stable_soft_gains_it_is_refused_with_a_reason():
     found = {one.kind: one for one in tune(case(lags=(3.0, 2.0)), search=None).tuned}
     assert found["soft"].controller is None
     assert "lag" in found["soft"].refusal
@@ -222,7 +222,7 @@ def test_broadband_is_refused_behind_these_lags(tuned):
 
 
 @pytest.mark.heavy
-def test_a_wrong_j_costs_what_the_notes_say(tuned):
+def test_the_effect_of_a_wrong_j(tuned):
     """With an error of J of 12.6 % all are stable. With 76 %, the controller that compensates half of J is unstable."""
     small, large = tuned["soft"].wrong
     assert small.stable and large.stable
@@ -261,7 +261,7 @@ def test_a_share_needs_the_name_plate():
 
 
 @pytest.mark.parametrize("name", ["siemens/s120-canopen", "siemens/g120", "abb/acs880-enhanced"])
-def test_profiles_that_know_their_speed_controller_are_not_asked_about_it_before_a_run(name):
+def test_profiles_with_a_speed_controller_need_no_question_before_a_run(name):
     profile = load_profile(name)
     assert profile.speed_controller is not None
     assert not any("speed_controller" in entry for entry, _ in profile.entries())

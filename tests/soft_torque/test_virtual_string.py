@@ -33,7 +33,7 @@ def phasor(time_s, values, hertz):
 
 
 @pytest.mark.heavy
-def test_a_top_that_swings_feels_the_impedance_of_the_lines():
+def test_an_oscillating_top_sees_the_impedance_of_the_lines():
     hertz, dt_s = 0.5, 0.02
     string = string_with(**SMOOTH, length_m=1000.0, drag=0.1)
     virtual = VirtualString(string)
@@ -47,7 +47,7 @@ def test_a_top_that_swings_feels_the_impedance_of_the_lines():
     assert abs(found - theory) < 0.02 * (abs(theory) + string.impedance_nm_s_rad)
 
 
-def test_steps_of_any_length_lead_to_the_same():
+def test_steps_of_any_length_give_the_same():
     fine, coarse = VirtualString(STRING), VirtualString(STRING)
     for one in (fine, coarse):
         one.begin(4.0)
@@ -62,7 +62,7 @@ def test_steps_of_any_length_lead_to_the_same():
     assert coarse.bit_rad_s == pytest.approx(fine.bit_rad_s, abs=1e-9)
 
 
-def test_a_bit_that_is_armed_breaks_away_at_once_and_a_stuck_one_winds_the_string_up():
+def test_a_bit_at_its_limit_breaks_away_at_once_and_a_stuck_one_twists_the_string():
     virtual = VirtualString(STRING)
     assert virtual.torque_nm == pytest.approx(STRING.bit.static_nm)
     virtual.begin(4.0)
@@ -72,12 +72,12 @@ def test_a_bit_that_is_armed_breaks_away_at_once_and_a_stuck_one_winds_the_strin
     virtual.release()
     for _ in range(500):
         virtual.step(4.0, 0.02)
-    assert virtual.bit_rad_s > 0.0      # the bit goes on: a top at constant speed gives no damping
+    assert virtual.bit_rad_s > 0.0      # the bit continues: a top at constant speed gives no damping
     virtual.arm()
     assert virtual.bit_rad_s == 0.0 and virtual.torque_nm == pytest.approx(STRING.bit.static_nm)
 
 
-def test_a_string_without_a_bit_is_none():
+def test_a_string_without_a_bit_is_refused():
     with pytest.raises(ValueError, match="no bit"):
         VirtualString(string_with(**{**SMOOTH, "coulomb_nm": None}))
 
@@ -86,7 +86,7 @@ def test_a_string_without_a_bit_is_none():
 
 
 @pytest.mark.parametrize("period_s", [0.004, 0.02])
-def test_the_controller_of_the_host_has_the_law_that_it_was_given(period_s):
+def test_the_controller_of_the_host_has_the_stated_law(period_s):
     hertz = 0.2
     host = HostController(HALF, (0.020, 0.010, 0.003), period_s)
     time_s = period_s * np.arange(round(50.0 / period_s))
@@ -103,7 +103,7 @@ def test_the_controller_of_the_host_has_the_law_that_it_was_given(period_s):
 
 
 @pytest.mark.parametrize(("lag_s", "period_s"), [(0.4, 0.01), (0.4, 0.05), (0.02, 0.02), (0.0, 0.02)])
-def test_the_observer_finds_a_speed_that_is_reported_late_and_a_torque_that_nobody_told_it(lag_s, period_s):
+def test_the_observer_estimates_a_lagged_speed_and_an_unknown_torque(lag_s, period_s):
     drive = TopDrive(1500.0, 8.0, 60.0)
     observer = RotorObserver(drive, lag_s, period_s)
     observer.begin(5.0)
@@ -142,7 +142,7 @@ def through(course, turns_from, *, sticks=True, longest_s=5000.0, period_s=0.1):
 
 
 @pytest.mark.parametrize("turns_from_rpm", [43.2, 50.0, 61.7])
-def test_the_course_finds_the_speed_from_which_the_bit_turns_to_one_rpm(turns_from_rpm):
+def test_the_program_finds_the_critical_speed_to_one_rpm(turns_from_rpm):
     program = SpeedProgram(40.0 * RPM, 80.0 * RPM)
     course = ProgramCourse(program, 0.1)
     trials, phases = through(course, turns_from_rpm * RPM)
@@ -154,7 +154,7 @@ def test_the_course_finds_the_speed_from_which_the_bit_turns_to_one_rpm(turns_fr
     assert all(program.start_rad_s < one <= program.highest_rad_s for one in trials)
 
 
-def test_the_course_ends_where_the_bit_never_sticks_or_never_turns():
+def test_the_program_ends_if_the_bit_never_sticks_or_never_turns():
     _, phases = through(ProgramCourse(SpeedProgram(40.0 * RPM, 60.0 * RPM), 0.1), 1e9, sticks=False)
     assert phases == [Phase.ARM, Phase.HOLD, Phase.FADE_OUT, Phase.DONE]
     trials, phases = through(ProgramCourse(SpeedProgram(40.0 * RPM, 60.0 * RPM), 0.1), 1e9)
@@ -163,7 +163,7 @@ def test_the_course_ends_where_the_bit_never_sticks_or_never_turns():
     assert len(trials) <= 8
 
 
-def test_the_set_speed_only_moves_on_ramps_and_the_string_only_fades():
+def test_the_set_speed_changes_only_on_ramps_and_the_string_only_fades():
     program = SpeedProgram(40.0 * RPM, 80.0 * RPM)
     course = ProgramCourse(program, 0.1)
     set_before, share_before = course.set_rad_s, course.share
@@ -191,7 +191,7 @@ def on_ideal_rotor(loop, program, rig, period_s, seconds, unknown_nm=0.0):
         rows.append(loop.row)
         speeds.append(speed / rig.gear_ratio)
         for _ in range(fine):
-            # exact for a speed that is constant over a hundredth of the lag
+            # exact for a constant speed over a hundredth of the lag
             reported += (speed - reported) * (1.0 - np.exp(-dt / rig.speed_lag_s))
             friction = rig.coulomb_nm * np.sign(speed) + rig.viscous_nm_s_rad * speed
             speed += (torque + unknown_nm - friction) / rig.inertia_kg_m2 * dt
@@ -205,7 +205,7 @@ def on_ideal_rotor(loop, program, rig, period_s, seconds, unknown_nm=0.0):
     IdentifiedRig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0),
     # the intended machine, with a motor that turns eight times as fast
 ], ids=["itself", "bench", "geared"])
-def test_the_loop_is_the_simulation_of_the_machine_that_is_meant(rig):
+def test_the_loop_agrees_with_the_simulation_of_the_intended_machine(rig):
     """Bit and top move as in `simulate` with the same law: first oscillations at 50 rpm, soft controller."""
     program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=2.0, hold_s=15.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 1e6)
@@ -222,17 +222,17 @@ def test_the_loop_is_the_simulation_of_the_machine_that_is_meant(rig):
     assert np.ptp(top) > 3.0 and bit.max() > 12.0
 
 
-def test_a_torque_limit_that_acts_shows_in_the_row():
+def test_an_active_torque_limit_is_in_the_row():
     rig = IdentifiedRig(1500.0, 8.0, 60.0, 0.4)
     program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=0.2, fade_s=1.0, hold_s=6.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 800.0)
     rows, _ = on_ideal_rotor(loop, program, rig, 0.02, 7.0)
     assert rows[:, 11].any()
-    assert rows[rows[:, 1] <= Phase.ARM, 11].sum() == 0     # fading in needs no torque at the shaft
+    assert rows[rows[:, 1] <= Phase.ARM, 11].sum() == 0     # the fade-in needs no torque at the shaft
 
 
 @pytest.mark.heavy
-def test_fading_in_and_out_leaves_the_shaft_alone():
+def test_fading_in_and_out_does_not_move_the_shaft():
     """The drive's torque balances the string's torque while it is faded in and out."""
     rig = IdentifiedRig(1500.0, 8.0, 60.0, 0.4)
     program = SpeedProgram(70.0 * RPM, 90.0 * RPM, settle_s=1.0, fade_s=3.0, hold_s=30.0)
@@ -246,7 +246,7 @@ def test_fading_in_and_out_leaves_the_shaft_alone():
 
 
 @pytest.mark.parametrize(("gains", "unknown_nm"), [(1.0, (0.0, 120.0)), (1.6, (300.0, 2000.0))])
-def test_in_the_drives_own_loop_the_string_goes_through_the_offset_and_other_gains_show(gains, unknown_nm):
+def test_in_the_drives_own_loop_the_string_uses_the_offset_and_other_gains_are_found(gains, unknown_nm):
     """A drive runs its own PI controller, with a rounded set speed that the host does not know."""
     rig, period_s, fine = IdentifiedRig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0), 0.02, 10
     program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=8.0, armed_s=8.0, hold_s=15.0)

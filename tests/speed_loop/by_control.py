@@ -14,7 +14,7 @@ PADE, STEP_PADE = 6, 2
 
 
 def shaft(plant: LoopPlant, at_load: float = 0.0):
-    """ω/T by the equations of motion; ``at_load``: viscous friction of the load."""
+    """Return ω/T by the equations of motion. ``at_load``: viscous friction of the load."""
     inertia, viscous, spring = plant.inertia_kg_m2, plant.viscous_nm_s_rad, plant.spring
     if spring is None:
         return control.tf([1.0], [inertia, viscous])
@@ -25,7 +25,7 @@ def shaft(plant: LoopPlant, at_load: float = 0.0):
 
 
 def forward(plant: LoopPlant, gains: PiGains, at_load: float = 0.0, order: int = PADE):
-    """From the speed error to the motor's speed."""
+    """Return the response from the speed error to the motor's speed."""
     s = control.tf("s")
     found = (gains.gain_nm_s_rad + gains.integral_nm_rad / s) * shaft(plant, at_load)
     if gains.notch is not None:
@@ -40,7 +40,7 @@ def forward(plant: LoopPlant, gains: PiGains, at_load: float = 0.0, order: int =
 
 
 def filter_of(plant: LoopPlant):
-    """The filter of the measured speed."""
+    """Return the filter of the measured speed."""
     return control.tf([1.0], [plant.lags_s[0], 1.0]) if plant.lags_s else control.tf([1.0], [1.0])
 
 
@@ -56,6 +56,6 @@ def true_margins(plant: LoopPlant, gains: PiGains, at_load: float = 0.0) -> Spee
 
 
 def step(plant: LoopPlant, gains: PiGains, time_s: np.ndarray) -> np.ndarray:
-    """The motor's speed after a unit step of the set speed."""
+    """Return the motor's speed after a unit step of the set speed."""
     closed = control.feedback(forward(plant, gains, order=STEP_PADE), filter_of(plant))
     return np.asarray(control.forced_response(control.ss(closed), time_s, np.ones_like(time_s)).outputs)

@@ -1,4 +1,4 @@
-"""Gains from intervals: the margins hold on every corner and inside the box, a notch where it helps, refusals."""
+"""Gains from intervals: margins on every corner and inside the box, a useful notch, refusals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COMPLIANT = UncertainPlant(
 
 
 def inside(plant: UncertainPlant, seed: int) -> LoopPlant:
-    """A plant drawn from within all intervals."""
+    """Return a plant drawn from within all intervals."""
     rng = np.random.default_rng(seed)
 
     def drawn(part: Range) -> Range:
@@ -75,7 +75,7 @@ def test_the_margins_hold_inside_the_box_too(plant):
         assert found.keeps(44.9, 7.95)
 
 
-def test_a_requested_bandwidth_is_met_or_refused_with_the_largest_that_fits():
+def test_a_requested_bandwidth_is_met_or_refused_with_the_largest_possible_one():
     design = design_speed_loop(SpeedLoopCase(RIGID, bandwidth_hz=1.0, present=PiGains(300.0, 300.0)))
     assert [row.kind for row in design.rows] == ["present", "tuned"]
     assert design.tuned.bandwidth_hz.value == pytest.approx(1.0, rel=1e-6)
@@ -85,7 +85,7 @@ def test_a_requested_bandwidth_is_met_or_refused_with_the_largest_that_fits():
 
 @pytest.mark.parametrize("largest_hz", [4.97, 10.7])
 def test_the_bandwidth_that_the_refusal_advises_fits(largest_hz):
-    """The largest one, 4.97 Hz, was rounded to 5 Hz in the advice, which is refused again."""
+    """The largest one, 4.97 Hz, used to be rounded to 5 Hz in the advice, which was refused again."""
     scale = design_speed_loop(SpeedLoopCase(RIGID)).tuned.bandwidth_hz.value / largest_hz
 
     def scaled(one):
@@ -117,7 +117,7 @@ def test_a_present_loop_that_is_unstable_has_no_step_response():
 
 
 def test_the_measured_shaft_is_put_into_the_loop():
-    """A report with lags on both signals gives the same loop as the shaft that it is of."""
+    """A report with lags on both signals gives the same loop as its true shaft."""
     design = design_speed_loop(SpeedLoopCase(RIGID))
     believed, gains = design.case.plant.believed, design.tuned.gains
     hertz = np.array([0.1, 0.4, 1.0])      # all far below the bandwidth

@@ -25,7 +25,7 @@ from tests.speed_loop import by_control
 
 
 def random_loop(seed: int) -> tuple[LoopPlant, PiGains]:
-    """A rigid shaft, or two masses on a spring; every fourth with a notch."""
+    """Return a rigid shaft or two masses on a spring; every fourth one has a notch."""
     rng = np.random.default_rng(seed)
     inertia, lags = 10.0 ** rng.uniform(-2.0, 3.0), tuple(rng.uniform(0.003, 0.03, 2))
     spring = notch = None
@@ -64,7 +64,7 @@ def test_the_step_response_is_that_of_python_control(seed):
 
 
 def test_a_rigid_shaft_without_lags_has_the_margins_of_a_text_book():
-    """P = 1, I = 0.25, J = 1: a double pole at −0.5, T = (s + 0.25)/(s + 0.5)², no phase crossover."""
+    """P = 1, I = 0.25, J = 1 give a double pole at −0.5, T = (s + 0.25)/(s + 0.5)², and no phase crossover."""
     plant, gains = LoopPlant(1.0, 0.0, (1e-6,)), PiGains(1.0, 0.25)
     found = speed_loop_margins([plant], gains)[0]
     crossover = math.sqrt((1.0 + math.sqrt(1.25)) / 2.0)
@@ -80,7 +80,7 @@ def test_a_rigid_shaft_without_lags_has_the_margins_of_a_text_book():
 
 @pytest.mark.parametrize(("factor", "stable", "conditional"), [(4.0, True, True), (0.25, False, False)])
 def test_a_loop_that_a_lower_gain_destabilises_is_named(factor, stable, conditional):
-    """K (s + 1)²/s³, a text book's conditionally stable loop: stable above K = 0.5, −180° at 1 rad/s with |L| = 2 K."""
+    """The textbook loop K (s + 1)²/s³ is stable above K = 0.5. Its phase is −180° at 1 rad/s, with |L| = 2 K."""
     omega = np.geomspace(1e-3, 1e3, 2000)
     s = 1j * omega
     loop = factor * (s + 1.0) ** 2 / s**3
@@ -95,7 +95,7 @@ def test_a_speed_that_does_not_arrive_has_no_rise():
 
 
 def test_gains_far_slower_than_the_lags_have_margins_too():
-    """P/J is a thousandth of a thousandth of 1/Στ."""
+    """P/J is a millionth of 1/Στ."""
     found = speed_loop_margins([LoopPlant(1.0, 0.0, (0.01,))], PiGains(1e-4, 2.5e-9))[0]
     assert found.stable and 70.0 < found.phase_deg < 80.0
     assert 1e-5 < found.bandwidth_hz < 3e-5
@@ -116,7 +116,7 @@ def test_a_shallow_notch_has_no_width_of_3_db():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("rate_1_s", [50.0, 1e5])       # the powers overflow; the matrix exponential itself does
+@pytest.mark.parametrize("rate_1_s", [50.0, 1e5])       # the powers overflow, or the matrix exponential itself
 def test_a_loop_whose_response_overflows_never_settles(rate_1_s):
     a, b, c = np.array([[rate_1_s, 1.0], [0.0, rate_1_s]]), np.array([1.0, -1.0]), np.array([1.0, 0.0])
     (speed,) = loop_responses([(a, b, c)], [30.0])

@@ -1,4 +1,4 @@
-"""The predicted step response beside the one of the simulated drive, which shares no code with the prediction."""
+"""Predicted step response, compared with the simulated drive, which shares no code with the prediction."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_simulated_drive_steps_as_predicted(bandwidth_hz):
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.3])
-def test_gains_typed_wrongly_by_30_percent_do_not_step_as_predicted(factor):
+def test_gains_with_an_error_of_30_percent_do_not_step_as_predicted(factor):
     row = design_speed_loop(SpeedLoopCase(KNOWN)).tuned
     found = simulated(PiGains(factor * row.gains.gain_nm_s_rad, row.gains.integral_nm_rad))
     assert not row.rise_s.low <= found.rise_s <= row.rise_s.high

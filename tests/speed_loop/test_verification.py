@@ -1,4 +1,4 @@
-"""Steps beside their prediction: the responses are computed by python-control, their lag and noise by this file."""
+"""Steps compared with their prediction: python-control computes the responses, this file lag and noise."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ PARAMETERS = pytest.mark.parametrize(("proportional", "integral"), [(1.3, 1.0), 
 
 def responses(gains: PiGains, noise: float = 0.02, lag_s: float = 0.3, ramp_s: float = 0.0, seed: int = 1,
               plant: LoopPlant = PLANT.believed):
-    """Reported response in each pair: the true plant, a first-order lag, a cycle of delay, an optional ramp, noise."""
+    """Return the reported response in each pair: true plant, lag, one cycle of delay, optional ramp, noise."""
     rng = np.random.default_rng(seed)
     fine = 0.002
     time_s = fine * np.arange(round(2.0 * PROGRAM.half_s / fine))
@@ -64,7 +64,7 @@ def responses(gains: PiGains, noise: float = 0.02, lag_s: float = 0.3, ramp_s: f
 
 
 def rounded(gains: PiGains, noise_counts: float, to=np.round, seed: int = 1):
-    """Reported response in each pair of a drive that rounds its speed. Its set speeds are whole counts."""
+    """Return the reported response in each pair of a drive that rounds its speed. Its set speeds are whole counts."""
     rng = np.random.default_rng(seed)
     counts = COUNTS * responses(gains, noise=0.0)[0]
     halves = [to(sign * counts + noise_counts * rng.standard_normal((ROUNDED.pairs, len(counts)))) for sign in (1, -1)]
@@ -87,7 +87,7 @@ def test_typed_gains_agree_and_their_intervals_cover_the_truth():
 
 @pytest.mark.heavy(but_first=1)
 @PARAMETERS
-def test_gains_typed_wrongly_by_30_percent_differ_and_are_named(proportional, integral):
+def test_gains_with_an_error_of_30_percent_differ_and_are_named(proportional, integral):
     wrong = PiGains(proportional * CASE.gains.gain_nm_s_rad, integral * CASE.gains.integral_nm_rad)
     result = found(responses(wrong))
     assert result.outcome is StepOutcome.DIFFERS
@@ -109,7 +109,7 @@ def test_gains_are_unbiased_where_the_report_is_rounded_to_tenths_of_the_step(to
 
 
 @pytest.mark.parametrize("to", [np.round, np.floor])
-def test_steps_that_are_all_rounded_alike_tell_nothing(to):
+def test_steps_that_are_all_rounded_alike_give_no_result(to):
     for seed in range(1, 4):
         result = found(rounded(CASE.gains, 0.01, to, seed), ROUNDED)
         assert result.outcome is StepOutcome.CANNOT_TELL, seed
@@ -131,7 +131,7 @@ def test_slow_noise_is_weighted_by_its_spectrum():
     assert np.mean(widths) < 3.1, widths          # 4.1 with equal weights
 
 
-def test_noise_that_hides_30_percent_is_not_called_agreement():
+def test_noise_that_hides_30_percent_is_no_agreement():
     assert found(responses(CASE.gains, noise=0.6)).outcome is StepOutcome.CANNOT_TELL
 
 
@@ -157,20 +157,20 @@ def test_a_response_that_a_fit_explains_by_a_delay_beyond_its_end_is_judged():
     assert model.reported(late) == pytest.approx(np.ones(count))
 
 
-def test_a_limit_that_acted_or_too_few_pairs_tell_nothing():
+def test_an_active_limit_or_too_few_pairs_give_no_result():
     pairs = responses(CASE.gains)
     assert found(pairs, limited=True).outcome is StepOutcome.CANNOT_TELL
     assert found(pairs[:5]).outcome is StepOutcome.CANNOT_TELL
     assert found(pairs[:0]).outcome is StepOutcome.CANNOT_TELL
 
 
-def test_the_case_comes_back_from_the_log():
+def test_the_case_is_restored_from_the_log():
     assert step_case_of(json.loads(json.dumps(CASE.plain()))) == CASE
     with pytest.raises((KeyError, TypeError)):
         step_case_of({"plant": {}})
 
 
-def test_a_coupling_above_the_excited_lines_does_not_bend_the_gains():
+def test_a_coupling_above_the_excited_lines_does_not_bias_the_gains():
     """J is known, and 40 % of it is behind a coupling that the result does not have."""
     rigid, low_hz = PLANT.believed, 8.0 * CASE.gains.gain_nm_s_rad / (2.0 * np.pi * 104.0)
     coupled = replace(rigid, inertia_kg_m2=0.6 * 104.0, spring=SpringLoad(low_hz, low_hz / np.sqrt(0.6), 80.0))
@@ -182,7 +182,7 @@ def test_a_coupling_above_the_excited_lines_does_not_bend_the_gains():
     assert result.misfit_p > 0.01
 
 
-def test_the_fit_from_the_prediction_counts_where_the_other_one_ends_in_another_minimum(monkeypatch):
+def test_the_fit_from_the_prediction_counts_if_the_other_one_ends_in_another_minimum(monkeypatch):
     """Seed 100113 of `benchmarks/speed_loop_verify.py`: the fit of the whole response led to these parameters."""
     whole = verification._fitted
     elsewhere = np.array([-0.23, -0.26, -6.02, 6.48, 5.36, 0.12, 1.26, 0.22, 3.73, 0.05, -0.33])
@@ -222,7 +222,7 @@ def test_a_record_gives_the_pairs_of_its_whole_steps():
     record = StepRecord(time_s, speed, ~limited, limited, starts, PERIOD_S)
     assert verify_record(CASE, program, record).pairs == program.pairs
     at_end = replace(record, time_s=time_s[:-1], speed_rad_s=speed[:-1], fresh=~limited[:-1], limited=limited[:-1])
-    assert verify_record(CASE, program, at_end).pairs == program.pairs     # as the run sees it after its last step
+    assert verify_record(CASE, program, at_end).pairs == program.pairs     # as in the run after its last step
     short = replace(record, time_s=time_s[:-9], speed_rad_s=speed[:-9], fresh=~limited[:-9], limited=limited[:-9])
     assert verify_record(CASE, program, short).pairs == program.pairs - 1
     acted = verify_record(CASE, program, replace(record, limited=time_s > 5.0))
@@ -242,17 +242,17 @@ def test_pairs_are_free_of_offset_and_drift_and_the_first_is_dropped():
     np.testing.assert_allclose(pairs, 1.0 - 0.5 * 1e-4 * program.half_s / program.step_rad_s, atol=1e-9)
 
 
-def test_where_the_response_excludes_all_draws_the_likeliest_ones_count():
+def test_if_the_response_excludes_all_draws_the_likeliest_ones_count():
     """One draw alone would give figures without a width."""
     kept = verification._possible(np.zeros(2), np.eye(2), lambda one: 1e6 * float(one @ one), 1.0)
     away = np.linalg.norm(kept, axis=1)
     assert len(kept) == 1 + verification._LEAST_KEPT
     assert away[0] == 0.0 and np.all(np.diff(away) >= 0.0)
-    assert away[-1] < 1.0      # four of ten of a normal distribution of two parameters
+    assert away[-1] < 1.0      # 40 % of a normal distribution of two parameters
 
 
-def test_the_figures_reach_as_far_as_p_and_i_with_few_pairs_and_with_many():
-    """Rise time and overshoot of random draws have Student's interval, as P and I: a joint coverage is of all rows."""
+def test_the_intervals_of_all_rows_have_the_confidence_of_p_and_i():
+    """Rise time and overshoot of random draws have Student's interval like P and I, for joint coverage of all rows."""
     widths = []
     for number in (8, 60):
         factor = float(stdtrit(number - 1, 1.0 - verification._TAIL))

@@ -1,4 +1,4 @@
-"""Simulates the two published designs once."""
+"""Fixtures that simulate the two published designs once."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The simulated studies by name, run with their defaults but for what a test names."""
+"""Simulated studies by name, with their defaults except for the settings of a test."""
 
 from tdhil.studies.registry import simulated_studies
 

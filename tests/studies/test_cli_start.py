@@ -1,4 +1,4 @@
-"""`tdhil study --help` comes quickly, and `tdhil --help` names the command."""
+"""Start of `tdhil study`: its help is quick, and `tdhil --help` names the command."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""`tdhil study`: what is listed, written, printed and refused. Most of it with two small studies made for it."""
+"""`tdhil study`: lists, files, output and refusals, mostly with two small studies made for the tests."""
 
 import contextlib
 import csv
@@ -30,7 +30,7 @@ class NoSeed(DataModel):
 
 
 class Made:
-    """A study of which every number is known."""
+    """Study with known numbers."""
 
     def __init__(self, name="table1", settings_model=Settings, error=None):
         self.name, self.title, self.settings_model, self.error = name, f"A small study, {name}", settings_model, error
@@ -51,7 +51,7 @@ class Made:
 
 @pytest.fixture
 def studies(monkeypatch):
-    """Two studies in place of the real ones."""
+    """Replace the real studies by two small ones."""
     known = {study.name: study for study in (Made(), Made("figure2", NoSeed))}
     monkeypatch.setattr(command, "all_studies", lambda: known)
     return known
@@ -100,14 +100,14 @@ def test_list_as_json(studies):
     (("list", "table1"), "'list' must be the only name"),
     (("paper", "table1"), "'paper' must be the only name"),
 ])
-def test_a_name_that_is_none_ends_with_one_line_and_exit_2(studies, arguments, said):
+def test_an_unknown_name_ends_with_one_line_and_exit_2(studies, arguments, said):
     code, out, err = tdhil(*arguments)
     assert (code, out) == (2, "")
     assert said in err
     assert len(err.splitlines()) == 1
 
 
-# -- what is written ---------------------------------------------------------------------------------------------
+# -- written files -----------------------------------------------------------------------------------------------
 
 
 def test_csv_settings_and_pictures_are_written(studies, tmp_path):
@@ -128,7 +128,7 @@ def test_csv_settings_and_pictures_are_written(studies, tmp_path):
     assert str(folder) in out.replace("\n", "")
 
 
-def test_the_same_again_gives_the_same_files(studies, tmp_path):
+def test_a_second_run_gives_the_same_files(studies, tmp_path):
     for folder in ("a", "b"):
         assert tdhil("table1", "--out", tmp_path / folder)[0] == 0
     for path in (tmp_path / "a" / "table1").iterdir():
@@ -140,7 +140,7 @@ def test_the_default_folder(studies, tmp_path):
     assert (tmp_path / "study" / "table1" / "numbers.csv").is_file()
 
 
-def test_without_matplotlib_all_but_the_pictures(studies, tmp_path, monkeypatch):
+def test_without_matplotlib_all_files_except_pictures_are_written(studies, tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
@@ -151,7 +151,7 @@ def test_without_matplotlib_all_but_the_pictures(studies, tmp_path, monkeypatch)
     assert "it holds" in out
 
 
-def test_what_is_printed_fits_80_columns_and_names_each_statement(studies):
+def test_the_output_fits_80_columns_and_names_each_statement(studies):
     code, out, err = tdhil("table1")
     assert code == 0
     assert max(len(line) for line in out.splitlines() if not line.startswith("files:")) <= 80
@@ -163,7 +163,7 @@ def test_what_is_printed_fits_80_columns_and_names_each_statement(studies):
 # -- json --------------------------------------------------------------------------------------------------------
 
 
-def test_json_is_one_document_and_nothing_else(studies):
+def test_json_is_one_document_only(studies):
     code, out, err = tdhil("table1", "--json")
     assert code == 0
     document = json.loads(out)
@@ -285,7 +285,7 @@ def test_paper_without_jinja2_is_written_as_markdown(studies, tmp_path, monkeypa
     assert "it does not (does not hold)" in page
 
 
-def test_one_study_that_fails_does_not_take_the_report_with_it(studies, tmp_path):
+def test_one_failed_study_does_not_prevent_the_report(studies, tmp_path):
     studies["figure2"].error = UsageError("the made error")
     code, out, err = tdhil("paper", "--json")
     assert code == 2
@@ -305,7 +305,7 @@ def test_ctrl_c_ends_with_130(studies):
 
 
 @pytest.mark.heavy
-def test_on_a_terminal_a_bar_moves_and_leaves_nothing_behind(studies, monkeypatch):
+def test_on_a_terminal_a_bar_moves_and_is_removed(studies, monkeypatch):
     from rich.console import Console
 
     from tdhil.report import console

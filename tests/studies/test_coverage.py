@@ -1,4 +1,4 @@
-"""The benchmark itself: its statistics against known ones, and a smaller fixed-seed version of it."""
+"""Coverage benchmark: its statistics compared with known ones, and a small version with fixed seeds."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def test_the_bounds_of_a_share_are_scipys(hits: int, tries: int) -> None:
     assert clopper_pearson(hits, tries) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
-def test_the_fleet_spans_what_the_proof_asks() -> None:
+def test_the_fleet_spans_the_required_range() -> None:
     assert len(FLEET) >= 12
     assert len({plant.name for plant in FLEET}) == len(FLEET)
     inertias = [plant.inertia_kg_m2 for plant in FLEET]
@@ -53,7 +53,7 @@ def test_the_fleet_spans_what_the_proof_asks() -> None:
 
 
 def test_the_bound_of_two_parameters_is_the_hand_computed_one() -> None:
-    """One line, J and B free, all else known: F = 2|W|²/v · diag(ω², 1), so sd(J) = √(v/2)/(ω|W|)."""
+    """With one line and only J and B free, F = 2|W|²/v · diag(ω², 1), so sd(J) = √(v/2)/(ω|W|)."""
     plant = replace(PLANT["field"], speed_report=ReportFilter(), torque_report=ReportFilter(),
                     noise=PlantNoise(reported_torque_nm=2.0))
     hertz, wave, seconds = np.array([0.2]), 0.5, 100.0
@@ -67,22 +67,22 @@ def test_the_bound_of_two_parameters_is_the_hand_computed_one() -> None:
     assert bound_of(lines) == pytest.approx(np.sqrt(v / 2.0) / (2.0 * np.pi * 0.2 * wave), rel=1e-6)
 
 
-def test_what_cannot_be_told_apart_has_no_bound() -> None:
+def test_indistinguishable_parameters_have_no_bound() -> None:
     assert bound_of(np.array([[1.0, 1.0], [1.0, 1.0]])) is None
 
 
 @pytest.mark.heavy
 def test_the_notes_design_has_about_the_notes_bound() -> None:
-    """Half a percent at the notes' 240 s and lines; the default plan of 200 s is somewhat tighter."""
+    """The bound is 0.5 % with 240 s and the lines of the notes. The default plan of 200 s is slightly better."""
     bound = cramer_rao(PLANT["field"], 10)
     assert bound.known is not None
     assert bound.unknown is not None
     assert 0.10 < bound.known < 0.50
-    assert 1.2 * bound.known < bound.unknown < 2.0 * bound.known     # what not knowing the filters costs anybody
+    assert 1.2 * bound.known < bound.unknown < 2.0 * bound.known     # cost of unknown filters
 
 
-def test_equal_poles_are_no_more_told_apart_for_being_equal() -> None:
-    """Three equal poles leave the bound of who counts them singular, and hardly change that of who doesn't."""
+def test_equal_poles_do_not_change_the_bound() -> None:
+    """Equal and nearly equal poles have the same bound. There is no bound with the poles as the parameters."""
     hertz = 0.1 * np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
     watched = [WatchedSpeed(speed, np.full(6, 0.3 + 0j), 100.0) for speed in (3.0, 5.0)]
     bounds = []
@@ -102,7 +102,7 @@ def _runs(values: list[tuple[float, float] | None]) -> list[SimulatedRun]:
     ]
 
 
-def test_figures_count_misses_among_the_runs_that_gave_a_number() -> None:
+def test_figures_count_misses_among_runs_with_a_number() -> None:
     found = figures_of(PLANT["field"], _runs([(104.0, 1.0), (106.0, 1.0), None, (103.0, 1.5)]), Bounds(0.5, 0.8))
     assert (found.runs, found.refused, found.misses, found.answered) == (4, 1, 1, 3)
     assert found.miss_rate == pytest.approx(1.0 / 3.0)
@@ -113,7 +113,7 @@ def test_figures_count_misses_among_the_runs_that_gave_a_number() -> None:
     assert found.width_over_unknown(2.0) == pytest.approx(3.5 / 3.0 / 1.6)
 
 
-def test_the_bounds_of_the_proof_refuse_what_they_should() -> None:
+def test_the_bounds_of_the_proof_refuse_bad_figures() -> None:
     field = PLANT["field"]
     misses = figures_of(field, _runs([(106.0, 1.0)] * 20 + [(104.0, 1.0)] * 80), _NO_BOUND)
     assert covers(misses, 0.05) is False
@@ -131,7 +131,7 @@ def test_the_bounds_of_the_proof_refuse_what_they_should() -> None:
     pytest.param(3, 4, marks=pytest.mark.heavy), pytest.param(12, 10, marks=pytest.mark.long),
 ])
 def test_a_small_version_holds_and_does_not_depend_on_the_processes(seeds: int, periods: int) -> None:
-    """Four plants of four kinds, a few runs each: with so few, only what is grossly wrong breaks a bound."""
+    """It has four plants of four kinds with a few runs each, so only gross errors exceed a bound."""
     heard: list[float] = []
     plants = ["coarse", "field", "average", "modbus"]
     settings = CoverageSettings(seeds=seeds, periods=periods, plants=plants, processes=2)

@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of the benchmark: the figures of what was done are kept, shown, and called what they are."""
+"""Ctrl-C during the benchmark: the figures of completed runs are kept, shown, and marked as partial."""
 
 import json
 import os
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def some_runs(wanted, processes):
-    """Two groups, then Ctrl-C."""
+    """Run two groups, then raise Ctrl-C."""
     for task in wanted[:2]:
         yield tuple(SimulatedRun(task.plant.name, number, 100.0, "valid", "", 104.0, 103.0, 105.0)
                     for number in range(task.first, task.first + task.count))
@@ -30,7 +30,7 @@ def some_runs(wanted, processes):
 
 
 @pytest.mark.heavy
-def test_what_is_done_is_kept(monkeypatch):
+def test_completed_runs_are_kept(monkeypatch):
     monkeypatch.setattr(study, "run_all", some_runs)
     heard = []
     outcome = COVERAGE.run(CoverageSettings(seeds=60, plants=["field", "paper"]), lambda *told: heard.append(told))
@@ -42,7 +42,7 @@ def test_what_is_done_is_kept(monkeypatch):
     assert heard[-1] == (1.0, "interrupted")
 
 
-def test_before_the_first_runs_there_is_nothing_to_keep(monkeypatch):
+def test_before_the_first_runs_no_data_are_kept(monkeypatch):
     def at_once(wanted, processes):
         raise KeyboardInterrupt
         yield
@@ -53,7 +53,7 @@ def test_before_the_first_runs_there_is_nothing_to_keep(monkeypatch):
 
 
 @pytest.mark.heavy
-def test_a_whole_benchmark_says_nothing_of_it(monkeypatch):
+def test_a_complete_benchmark_has_no_mark(monkeypatch):
     monkeypatch.setattr(study, "run_all", _all)
     outcome = COVERAGE.run(CoverageSettings(seeds=2, plants=["field"]), lambda *told: None)
     assert not outcome.interrupted
@@ -65,7 +65,7 @@ def _all(wanted, processes):
             for task in wanted]
 
 
-def test_where_there_is_no_terminal_a_line_a_minute(monkeypatch):
+def test_without_a_terminal_there_is_one_line_per_minute(monkeypatch):
     from io import StringIO
 
     from rich.console import Console
@@ -96,7 +96,7 @@ if __name__ == "__main__":
 
 @pytest.mark.heavy
 def test_ctrl_c_on_a_terminal(tmp_path):
-    """The whole command in a terminal of its own, which sends Ctrl-C to the workers too."""
+    """The whole command runs in its own terminal, which sends Ctrl-C to the workers too."""
     command = [sys.executable, "-c", ONE_BY_ONE, "study", "coverage", "--json", "--out", str(tmp_path / "out"),
                "--set", "seeds=2000", "--set", "plants=[coarse]", "--set", "periods=4"]
     leader, follower = pty.openpty()

@@ -1,4 +1,4 @@
-"""The benchmark's simulator against closed forms: every lag structure, the shaft, the noise."""
+"""Simulator of the benchmark, compared with closed forms: every lag structure, the shaft, the noise."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ PLANT = {plant.name: plant for plant in FLEET}
 
 
 def poles_by_scipy(report: ReportFilter, omega: float) -> complex:
-    """The poles from scipy; average and delay by their textbook forms."""
+    """Return poles by scipy, and average and delay by their textbook forms."""
     from scipy.signal import freqs
 
     bottom = np.array([1.0])
@@ -53,7 +53,7 @@ def test_a_report_has_its_closed_form_frequency_response(report: ReportFilter, h
 
 
 @pytest.mark.parametrize("name", ["servo", "field", "modbus"])
-def test_a_report_stands_still_at_the_start_if_its_signal_does(name: str) -> None:
+def test_a_report_is_constant_at_the_start_if_its_signal_is(name: str) -> None:
     report = replace(PLANT[name].speed_report, average_s=0.3)
     still = np.full((500, 1), 7.0)
     seen = shown(lagged(still, report, STEP)[:, 0], report, STEP, np.linspace(0.0, 0.9, 50))
@@ -61,7 +61,7 @@ def test_a_report_stands_still_at_the_start_if_its_signal_does(name: str) -> Non
 
 
 @pytest.mark.heavy
-def test_the_shaft_obeys_newton_at_every_line() -> None:
+def test_the_shaft_follows_newton_at_every_line() -> None:
     plant = PLANT["field"]
     asked, shaft = quiet_shaft(plant, np.array([-1.0, 1.0]), 4)
     for run, segments in enumerate(asked.segments):
@@ -83,8 +83,8 @@ def test_the_shaft_obeys_newton_at_every_line() -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["stribeck", "fan"])
-def test_bent_friction_is_where_scipy_s_integrator_has_it(name: str) -> None:
-    """The torque of the run as given, taken as straight between steps, through an integrator of scipy's."""
+def test_nonlinear_friction_agrees_with_an_integrator_of_scipy(name: str) -> None:
+    """The reference integrates the torque of the run, linear between steps, with scipy."""
     from scipy.integrate import solve_ivp
 
     plant = PLANT[name]
@@ -112,7 +112,7 @@ def test_the_load_is_coloured_as_stated() -> None:
 
 
 @pytest.mark.heavy
-def test_a_run_does_not_depend_on_its_company() -> None:
+def test_a_run_does_not_depend_on_the_other_runs() -> None:
     plant = PLANT["coarse"]
     alone = simulate(plant, [(1, 2, 3)], 4)[0]
     among = simulate(plant, [(1, 2, 9), (1, 2, 3)], 4)[1]

@@ -1,4 +1,4 @@
-"""Orthogonality: what is one passes, what is almost one does not, and says where."""
+"""Orthogonal arrays: true ones are accepted, nearly orthogonal ones are refused with the place."""
 
 from itertools import product
 
@@ -35,7 +35,7 @@ def test_run_16_as_printed_would_break_the_array():
 
 @st.composite
 def linear_arrays(draw):
-    """Bose's construction over a prime p: columns i, j, i + j, … i + (p − 1)j of all (i, j), shuffled."""
+    """Generate arrays by Bose's construction over a prime p, columns i, j, i + j, … i + (p − 1)j of all (i, j)."""
     prime = draw(st.sampled_from([2, 3, 5]))
     columns = draw(st.integers(2, prime + 1))
     pairs = product(range(prime), repeat=2)
@@ -118,7 +118,7 @@ def test_fewer_factors_than_columns_use_the_first_columns():
     ({"array": "L8"}, "no array 'L8'"),
     ({"array": ((1, 1), (1, 2), (2, 1), (2, 1))}, "not orthogonal"),
 ])
-def test_a_design_that_cannot_be_is_refused(changes, words):
+def test_an_impossible_design_is_refused(changes, words):
     with pytest.raises(ValidationError) as caught:
         design(**changes)
     assert words in str(caught.value)

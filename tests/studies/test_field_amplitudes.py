@@ -1,4 +1,4 @@
-"""Figures 20, 21 and 23 through the CANopen path: trends as published, and what can't be met said in words."""
+"""Figures 20, 21 and 23 by the CANopen path: published trends, and sentences on trends that cannot be met."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def holds(outcome, part):
 
 
 def test_the_bus_agrees_with_the_linear_loop(swept):
-    """Two derivations: frames, drive, plant and Fourier coefficients; and a transfer function."""
+    """Both derivations agree: frames, drive, plant and Fourier coefficients; and a transfer function."""
     assert column(swept, "output_rad_s") == pytest.approx(column(swept, "linear_loop_output_rad_s"), rel=0.012)
     assert np.all(column(swept, "share_at_limit") == 0.0)
 
@@ -60,7 +60,7 @@ def test_figure20_falls_then_rises():
 
 
 @pytest.mark.long
-def test_figure21_is_least_at_the_lowest_i_and_says_why_it_does_not_rise_throughout():
+def test_figure21_is_least_at_the_lowest_i_and_explains_why_it_does_not_rise_throughout():
     outcome = ran("figure21")
     assert column(outcome, "ki_nm_rad")[[0, -1]].tolist() == [200.0, 2500.0]
     assert int(np.argmin(column(outcome, "difference_rad_s"))) == 0
@@ -103,7 +103,7 @@ def test_pictures_can_be_drawn(swept):
 
 
 def test_without_filters_the_loop_is_the_textbook_s():
-    """(K_p s + K_i)/(J s² + (K_p + B) s + K_i)."""
+    """The reference is (K_p s + K_i)/(J s² + (K_p + B) s + K_i)."""
     rig = SimulatedRig(loop_filter_s=0.0, loop_torque_lag_s=0.0)
     hertz = np.array([0.05, 0.2, 0.7, 2.0])
     s = 2j * np.pi * hertz

@@ -1,4 +1,4 @@
-"""The bench of the field studies is the real path: it repeats, it refuses, and Ctrl-C stops it."""
+"""Bench of the field studies on the real path: repeatability, refusals, and Ctrl-C."""
 
 import signal
 
@@ -48,7 +48,7 @@ def test_progress_rises_to_one():
 
 
 @pytest.mark.heavy
-def test_what_does_not_fit_is_refused_with_the_limit():
+def test_a_motion_that_does_not_fit_is_refused_with_the_limit():
     with pytest.raises(LimitHit, match="torque limit"):
         run(amplitude_rad_s=1.5)
 
@@ -68,7 +68,7 @@ def test_ctrl_c_ends_it_as_an_interruption():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_the_wish_reaches_plant_and_guard():
+def test_the_request_reaches_plant_and_guard():
     asked = wish(torque_limit_nm=1500.0, speed_gain_nm_s_rad=700.0)
     plant, rig = plant_of(asked), bench_rig(asked)
     assert plant.drive.speed_gain_nm_s_rad == 700.0

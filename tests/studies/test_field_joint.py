@@ -1,4 +1,4 @@
-"""Several records as one: what is kept, and what the paper's slope is expected to be."""
+"""Several records as one: kept samples, and the expected slope of the paper's method."""
 
 from itertools import pairwise
 
@@ -15,7 +15,7 @@ INERTIA, VISCOUS, COULOMB, SPEED_LAG, TORQUE_LAG = 104.0, 8.0, 60.0, 0.40, 0.15
 
 
 def record(hertz, offset_rad_s, *, seed=0, torque_offset_nm=0.0, start_s=7.0, amplitude=1.0):
-    """Exact periodic motion of a rigid shaft behind two first-order lags, with some noise, at 50 Hz."""
+    """Return an exact periodic motion of a rigid shaft with two first-order lags and noise, at 50 Hz."""
     rng = np.random.default_rng(seed)
     time = start_s - 2.0 + 0.02 * np.arange(round((24.0 + 60.0) / 0.02))
     s = 2j * np.pi * hertz
@@ -46,7 +46,7 @@ def records():
 
 
 def test_a_published_fit_of_the_four_slopes_is_reproduced():
-    """J 103.75, lags 0.403 and 0.151 s: 0.10 kg·m² RMS from the published slopes (B = 0)."""
+    """J 103.75 and lags of 0.403 and 0.151 s give the published slopes within 0.10 kg·m² RMS (B = 0)."""
     slopes = expected_slope(np.array([0.1, 0.3, 0.5, 1.0]), 103.75, 0.0, 0.403, 0.151, 0.0)
     assert np.sqrt(np.mean((slopes - [105.379, 116.557, 135.622, 185.757]) ** 2)) == pytest.approx(0.10, abs=0.005)
 

@@ -1,4 +1,4 @@
-"""Figure 19 through the CANopen path: the loop moves the shaft, and leaves the slope alone."""
+"""Figure 19 by the CANopen path: the loop changes the motion of the shaft, but not the slope."""
 
 import pytest
 
@@ -29,7 +29,7 @@ def test_the_motion_is_not_the_same(outcome):
     assert max(motion) > 1.2 * min(motion)
 
 
-def test_it_says_that_the_paper_s_claim_does_not_hold_and_why(outcome):
+def test_it_states_that_the_paper_s_claim_does_not_hold_and_why(outcome):
     claim, _, why = outcome.statements
     assert claim.holds is False
     assert why.holds is None

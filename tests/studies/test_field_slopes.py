@@ -1,4 +1,4 @@
-"""Figure 22 through the CANopen path: the published slopes, and one inertia behind them."""
+"""Figure 22 by the CANopen path: the published slopes, from one inertia."""
 
 import pytest
 
@@ -48,7 +48,7 @@ def test_its_curve_passes_through_all_four(outcome):
         assert found["joint_fit_slope_kg_m2"] == pytest.approx(found["published_slope_kg_m2"], rel=0.03)
 
 
-def test_what_can_be_met_holds_and_the_contradictions_are_named(outcome):
+def test_possible_statements_hold_and_the_contradictions_are_named(outcome):
     decided = [statement for statement in outcome.statements if statement.holds is not None]
     assert len(decided) == 9
     assert all(statement.holds for statement in decided)

@@ -1,4 +1,4 @@
-"""Proof 3 for figures 9 to 17: published trends, as numbers and as statements; and that the pictures can be drawn."""
+"""Proof 3 for figures 9 to 17: published trends as numbers and as statements, and the pictures."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ def gain_of(run_, **changes):
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["figure9", "figure10", "figure12", "figure13"])
 def test_gain_and_phase_are_those_of_the_linear_loop(outcomes, name):
-    """Dry friction that never reverses is a constant torque: it changes neither."""
+    """Dry friction without a reversal is a constant torque and changes neither of them."""
     document = outcomes[name].document
     swept = next(iter(document["runs"][0]))
     for one in document["runs"]:
@@ -53,7 +53,7 @@ def test_figure9_attenuation_and_lag_grow_with_inertia(outcomes):
 
 
 @pytest.mark.heavy
-def test_figure10_is_low_pass_but_for_a_rise_the_paper_does_not_mention(outcomes):
+def test_figure10_is_low_pass_except_for_a_rise_the_paper_does_not_mention(outcomes):
     found = outcomes["figure10"]
     assert np.allclose(column(found, "gain")[:3], 1.0, atol=0.03)
     assert np.all(np.diff(column(found, "gain")[1:]) < 0)
@@ -64,7 +64,7 @@ def test_figure10_is_low_pass_but_for_a_rise_the_paper_does_not_mention(outcomes
 
 @pytest.mark.heavy
 def test_figure10_falls_throughout_where_the_loop_allows_it():
-    """2KiJ < 2KpB + B²: no gain above 1 anywhere, and the statement holds outright."""
+    """With 2KiJ < 2KpB + B² no gain is above 1, and the statement holds without exception."""
     found = run("figure10", ki_nm_rad=100.0, viscous_nm_s_rad=200.0, values=(0.2, 0.5, 1.0, 2.0))
     assert np.all(np.diff(column(found, "gain_fundamental")) < 0)
     assert said(found)["the output amplitude falls with every rise in frequency"] is True
@@ -90,7 +90,7 @@ def test_figure12_gain_grows_and_lag_falls_with_p(outcomes):
 
 
 @pytest.mark.heavy
-def test_figure13_amplitude_comes_nearer_and_lag_grows_with_i(outcomes):
+def test_figure13_amplitude_approaches_the_request_and_lag_grows_with_i(outcomes):
     found = outcomes["figure13"]
     assert np.all(np.diff(np.abs(column(found, "amplitude_difference_rad_s"))) < 0)
     assert np.all(np.diff(column(found, "phase_lag_zero_crossing_deg")) > 0)
@@ -98,8 +98,8 @@ def test_figure13_amplitude_comes_nearer_and_lag_grows_with_i(outcomes):
 
 
 @pytest.mark.heavy
-def test_a_trend_that_fails_is_said_to_fail():
-    """The same words on other settings: far below resonance more I means more amplitude than was asked."""
+def test_a_trend_that_fails_is_reported_as_failed():
+    """The same statement fails with other settings: far below resonance, more I gives more amplitude than requested."""
     found = run("figure13", frequency_hz=0.2, duration_s=50.0, sample_period_s=0.002)
     assert said(found)["the output amplitude comes nearer to the input's as I grows"] is False
 

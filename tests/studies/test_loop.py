@@ -1,4 +1,4 @@
-"""The closed loop against linear theory, against a finer step, and its references."""
+"""Closed loop, compared with linear theory and with a finer step; and its reference signals."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_without_dry_friction_it_is_a_linear_system():
 
 
 def test_with_dahl_friction_it_is_the_papers_equations():
-    """Integrated by another program: e, ∫e, ω and z of equations 4, 6, 9 and 10."""
+    """An independent program integrates e, ∫e, ω and z of equations 4, 6, 9 and 10."""
     run = changed(QUIET, coulomb_nm=82.4, duration_s=3.0)
     reference = SineReference(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
     limit = run.coulomb_nm / run.dahl_stiffness_nm_rad
@@ -59,7 +59,7 @@ def test_with_dahl_friction_it_is_the_papers_equations():
 
 @pytest.mark.heavy
 def test_half_the_step_hardly_changes_the_inertia():
-    """Sampled alike: only the integration differs."""
+    """The sampling is the same; only the integration differs."""
     coarse = changed(QUIET, coulomb_nm=82.4, duration_s=10.0, kp_nm_s_rad=10000.0)
     fine = changed(coarse, sample_period_s=0.0005)
     one = torque_line(*(column for index, column in enumerate(simulate([coarse]).of(0)) if index != 1))

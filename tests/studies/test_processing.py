@@ -37,19 +37,19 @@ def test_the_line_gives_inertia_and_intercept():
 
 
 def test_pairing_with_the_later_torque_adds_half_a_sample_of_viscous_friction():
-    """T = Jα + Bω sampled exactly: the slope is J + B·Ts/2 over whole periods."""
+    """With exact samples of T = Jα + Bω, the slope over whole periods is J + B·Ts/2."""
     step_s, turn = 0.01, 2.0 * np.pi * 0.5
     time = np.arange(0.0, 10.0 + step_s / 2, step_s)
     fit = torque_line(time, np.sin(turn * time), 100.0 * turn * np.cos(turn * time) + 80.0 * np.sin(turn * time))
     assert fit.inertia_kg_m2 == pytest.approx(100.0 + 80.0 * step_s / 2, rel=2e-4)
 
 
-def test_no_motion_no_line():
+def test_without_motion_there_is_no_line():
     with pytest.raises(ValueError, match="never changes"):
         torque_line(TIME, np.ones_like(TIME), TIME)
 
 
-def test_gain_is_output_over_input_not_what_equation_12_prints():
+def test_gain_is_output_over_input_not_the_printed_equation_12():
     assert amplitude(3.0 + 2.0 * np.sin(TIME)) == pytest.approx(2.0, abs=1e-6)
     assert gain(0.5 * np.sin(TIME), np.sin(TIME)) == pytest.approx(0.5)
 
@@ -81,7 +81,7 @@ def test_against_the_frequency_response_of_a_filter():
     assert found.lag_zeros_deg == pytest.approx(found.lag_fundamental_deg, abs=0.05)
 
 
-def test_the_fundamental_shrugs_at_harmonics_and_noise_that_move_zero_crossings():
+def test_the_fundamental_is_insensitive_to_harmonics_and_noise():
     rng = np.random.default_rng(3)
     pure = np.sin(2.0 * np.pi * TIME)
     dirty = pure + 0.3 * np.sin(6.0 * np.pi * TIME + 1.0) + 0.05 * rng.standard_normal(len(TIME))
@@ -96,7 +96,7 @@ def test_the_fundamental_is_the_fourier_coefficient_over_whole_periods():
     assert fundamental(TIME, wave, 1.0) == pytest.approx(fourier, abs=1e-9)
 
 
-def test_no_crossing_no_phase():
+def test_without_a_crossing_there_is_no_phase():
     assert np.isnan(phase_by_zeros(TIME, np.ones_like(TIME), np.sin(TIME), 1.0))
     assert len(rising_zeros(TIME, np.zeros_like(TIME))) == 0
 

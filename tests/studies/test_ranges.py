@@ -1,4 +1,4 @@
-"""Range analysis against a case done by hand."""
+"""Range analysis, compared with a case by hand."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ L4 = [(1, 1, 1), (1, 2, 2), (2, 1, 2), (2, 2, 1)]
 
 
 def test_by_hand():
-    """Runs 10, 14, 20, 36: means 12|28, 15|25, 23|17 and ranges 16, 10, 6."""
+    """Runs 10, 14, 20, 36 have the means 12|28, 15|25, 23|17 and the ranges 16, 10, 6."""
     effects = main_effects(L4, [10.0, 14.0, 20.0, 36.0])
     assert [effect.means for effect in effects] == [(12.0, 28.0), (15.0, 25.0), (23.0, 17.0)]
     assert [effect.range for effect in effects] == [16.0, 10.0, 6.0]
@@ -20,7 +20,7 @@ def test_by_hand():
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
-def test_a_saturated_array_gives_its_runs_back(runs):
+def test_a_saturated_array_reproduces_its_runs(runs):
     rows = shipped_arrays()["L9"]
     means = [effect.means for effect in main_effects(rows, runs)]
     assert np.allclose(runs_from_means(rows, means), runs, atol=1e-9)

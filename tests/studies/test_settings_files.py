@@ -77,7 +77,7 @@ def test_set_takes_fields_symbols_and_yaml_values():
     assert settings.frequency_hz == 1.0
 
 
-def test_set_finds_a_field_by_its_symbol_whatever_its_case_and_inside_a_section():
+def test_set_finds_a_field_by_its_symbol_in_any_case_and_inside_a_section():
     class Rig(DataModel):
         inertia_kg_m2: float = 104.0
 
@@ -89,7 +89,7 @@ def test_set_finds_a_field_by_its_symbol_whatever_its_case_and_inside_a_section(
     assert (settings.kp, settings.rig.inertia_kg_m2) == (500.0, 90.0)
 
 
-def test_set_goes_on_top_of_a_file(load):
+def test_set_takes_precedence_over_a_file(load):
     _, settings = load(GOOD)
     changed = with_assignments(settings, ["Kp=4000"])
     assert changed.kp_nm_s_rad == 4000.0

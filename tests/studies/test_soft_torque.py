@@ -1,6 +1,6 @@
-"""`tdhil study soft-torque`: theory stands as expected in every row; simulations are cut to almost nothing here.
+"""`tdhil study soft-torque`: theory in every row as expected; simulations are reduced to a minimum here.
 
-Cure speeds of four controllers: tests/soft_torque/test_simulation.py; the whole of it: the study itself, three minutes.
+For the cure speeds of four controllers see tests/soft_torque/test_simulation.py. The whole study takes three minutes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def test_theory_gives_the_reference_table():
     assert held == {name: name != IDEAL for name in EXPECTED}
 
 
-def test_a_figure_that_is_off_is_told_with_its_reason():
+def test_a_deviating_figure_is_reported_with_its_reason():
     rows = controllers(SoftTorqueSettings())[:1]
     found = [type(row)(**{**row.__dict__, "critical": CriticalSpeeds(183.0, 170.0)}) for row in rows]
     statement = controller_statements(found)[1]
@@ -45,7 +45,7 @@ def test_a_figure_that_is_off_is_told_with_its_reason():
 
 @pytest.mark.heavy
 def test_it_runs_and_draws(monkeypatch):
-    """The searches are stubbed: each has its own tests."""
+    """The searches are replaced by stubs, since each has its own tests."""
     pytest.importorskip("matplotlib")
     from matplotlib.figure import Figure
 
@@ -60,7 +60,7 @@ def test_it_runs_and_draws(monkeypatch):
     errors = outcome.tables[2].rows
     assert errors[3][-1] == errors[4][4] == "unstable"
     assert len(outcome.statements) == 2 * len(EXPECTED) + len(ERROR_ROWS) + 2
-    assert [one.holds for one in outcome.statements[-2:]] == [True, True]      # what can be compensated
+    assert [one.holds for one in outcome.statements[-2:]] == [True, True]      # possible compensation
     assert told == sorted(told)
     figure = Figure(figsize=outcome.figure_size_in)
     assert outcome.draw is not None

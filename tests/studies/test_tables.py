@@ -1,4 +1,4 @@
-"""Proof 1: Tables 6 and 7 come out. Published numbers are typed anew here, apart from the program's own copy."""
+"""Proof 1: Tables 6 and 7 are reproduced. The published numbers are stated here independently of the program."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ L16_RUNS = [
     878.63, 884.83, 889.58, 889.33, 890.63, 894.55, 889.36, 892.94, 899.82, 897.38, 891.97, 891.15, 894.99, 889.09,
     898.13, 898.82,
 ]
-# What the same settings gave when they were first inferred, by another program.
+# Results of another program with the same settings, from the first reconstruction.
 L9_REFERENCE = [898.30, 898.08, 897.59, 893.36, 893.13, 890.83, 886.73, 885.79, 885.40]
 L16_REFERENCE = [
     878.07, 886.06, 889.01, 888.68, 889.83, 893.38, 889.30, 893.10, 899.61, 898.30, 892.49, 889.67, 896.36, 891.28,
@@ -75,14 +75,14 @@ def test_both_agree_with_the_first_reconstruction(table6, table7):
 
 
 @pytest.mark.parametrize(("name", "printed", "runs"), [("table6", TABLE6, L16_RUNS), ("table7", TABLE7, L9_RUNS)])
-def test_the_data_file_says_what_the_paper_prints(name, printed, runs):
+def test_the_data_file_agrees_with_the_paper(name, printed, runs):
     design = published().design(name)
     assert {one.name: (list(one.mean_inertia_kg_m2), one.range_kg_m2) for one in design.factors} == printed
     assert np.allclose(design.runs_kg_m2, runs, atol=0.011)
 
 
 @pytest.mark.long
-def test_runs_stand_in_array_order_with_their_factors(table6, table7):
+def test_runs_are_in_array_order_with_their_factors(table6, table7):
     first, last = table6.document["runs"][0], table6.document["runs"][-1]
     assert [first[name] for name in TABLE6] == pytest.approx([0.1, 2500, 1500, 0.5, np.pi / 2])
     assert [last[name] for name in TABLE6] == pytest.approx([1.0, 15000, 1500, 1.5, np.pi])
@@ -105,7 +105,7 @@ def test_the_closed_form_explains_the_bias(table6, table7):
         found = np.array(column(outcome.tables[0], "inertia_kg_m2"))
         rest = np.abs(found - closed)
         assert np.mean(rest) < 0.15 * np.mean(np.abs(found - 900.0))
-        assert np.sort(rest)[-2] < within      # all but one: 4.6 at the smallest torque, where the bristle counts
+        assert np.sort(rest)[-2] < within      # all except one: 4.6 at the smallest torque, where the bristle matters
         assert np.corrcoef(found, closed)[0, 1] > 0.97
 
 
@@ -122,7 +122,7 @@ def test_the_closed_form_by_hand():
 
 
 @pytest.mark.long
-def test_what_is_said_about_the_tables(table6, table7):
+def test_statements_about_the_tables(table6, table7):
     assert holding(table6, "single runs") is True
     assert holding(table6, "A > D > E") is True
     assert holding(table6, "amplitude grows") is True
@@ -144,7 +144,7 @@ def test_the_noise_of_table_7_changes_nothing(table7):
 
 
 @pytest.mark.long
-def test_the_effect_table_carries_both(table6):
+def test_the_effect_table_contains_both(table6):
     table = table6.tables[1]
     ours = [row for row in table.rows if row[1] == "here"]
     theirs = [row for row in table.rows if row[1] == "published"]
@@ -167,7 +167,7 @@ def test_a_second_run_gives_the_same_to_the_last_bit():
     assert run_design(Table7Settings(duration_s=5.0, seed=2), lambda share: None).inertias != one.inertias
 
 
-def test_a_design_of_ones_own_has_no_published_columns():
+def test_a_custom_design_has_no_published_columns():
     settings = Table6Settings(
         array=((1, 1), (1, 2), (2, 1), (2, 2)), duration_s=4.0,
         factors=({"name": "J", "levels": (450.0, 900.0)}, {"name": "viscous_nm_s_rad", "levels": (10.0, 100.0)}),
@@ -200,7 +200,7 @@ def test_pictures(table6):
 
 
 def test_this_tool_finds_the_inertia_that_the_papers_fit_misses(table7):
-    """Lags declared absent, J 900, B 10, 50, 100: the paper's fit is 0.2 to 1.6 % low on these samples."""
+    """With declared zero lags, J 900 and B 10, 50, 100, the paper's fit is 0.2 to 1.6 % low on these samples."""
     found = np.array(column(table7.tables[0], "tdhil_kg_m2"))
     assert np.max(np.abs(found / 900.0 - 1.0)) < 0.001
     for run in table7.document["runs"]:

@@ -1,4 +1,4 @@
-"""What candump saw: running it beside a test, and reading its log (`candump -L`) with nothing of ours.
+"""candump beside a test, and a reader of its log (`candump -L`) without code of tdhil.
 
 A line is `(1700000000.123456) vcan0 605#4041600000000000`, time stamp, interface, identifier and data in hex; `705#R1`
 is a remote frame of one byte, eight digits make an identifier one of 29 bits.
@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 LINE = re.compile(r"\((\d+\.\d+)\) (\S+) ([0-9A-F]{3}|[0-9A-F]{8})#(R?)([0-9A-F]*)(?: [RT])?")
 RECEIVE_BYTES = 4 << 20
-"""Of candump's socket: one CPU, and a reader that comes late, must not lose a frame."""
+"""Size of candump's buffer, so that a late reader on one CPU loses no frame."""
 WAIT_S = 30.0
 
 
 class Seen(NamedTuple):
-    """A frame on the bus; ``stamp_s`` is the kernel's, wall clock."""
+    """Frame on the bus; ``stamp_s`` is the wall-clock time stamp of the kernel."""
 
     stamp_s: float
     identifier: int
@@ -32,7 +32,7 @@ class Seen(NamedTuple):
 
 
 def parse(text: str, interface: str) -> list[Seen]:
-    """All frames with 11-bit identifiers, in the bus's order; a last line that isn't whole is left out."""
+    """Return all frames with 11-bit identifiers in the order of the bus, without an incomplete last line."""
     found = []
     for line in text[: text.rfind("\n") + 1].splitlines():
         match = LINE.fullmatch(line)
@@ -46,26 +46,26 @@ def parse(text: str, interface: str) -> list[Seen]:
 
 
 class Candump:
-    """A candump under way."""
+    """Running candump."""
 
     def __init__(self, log: Path, interface: str) -> None:
         self.log, self.interface = log, interface
 
     @property
     def frames(self) -> list[Seen]:
-        """What it has seen so far; without the questions of stepped time (6FEh), which come as the machine is busy."""
+        """Return the frames so far, without the requests of stepped time (6FEh), whose number depends on the load."""
         return [frame for frame in parse(self.log.read_text(), self.interface) if frame.identifier != QUESTION]
 
 
 def listeners(interface: str) -> int:
-    """How many sockets take every frame of the interface, as the kernel counts them."""
+    """Return the kernel's count of sockets that receive every frame of the interface."""
     rows = Path("/proc/net/can/rcvlist_all").read_text().splitlines()
     return sum(row.split()[:1] == [interface] for row in rows)
 
 
 @contextmanager
 def watching(program: str, log: Path, interface: str) -> Iterator[Candump]:
-    """candump, from before the first frame until the end of the block; its log is whole afterwards."""
+    """Run candump from before the first frame until the end of the block. Its log is complete afterwards."""
     before, end_s = listeners(interface), time.monotonic() + WAIT_S
     with log.open("w") as file, subprocess.Popen(
         [program, "-L", "-r", str(RECEIVE_BYTES), interface], stdout=file, stderr=subprocess.DEVNULL
@@ -76,7 +76,7 @@ def watching(program: str, log: Path, interface: str) -> Iterator[Candump]:
                 assert time.monotonic() < end_s, "candump never bound its socket"
                 time.sleep(0.01)
             yield Candump(log, interface)
-            time.sleep(0.2)              # what the kernel still holds for it
+            time.sleep(0.2)              # frames still queued in the kernel
         finally:
             child.terminate()
             child.wait(WAIT_S)
@@ -93,10 +93,10 @@ ENABLE_OPERATION = 0x0F
 
 
 def setpoint(data: bytes) -> tuple[int, int, int]:
-    """RPDO1: 6040h control word, 6071h target torque (per mille), 60FFh target velocity (0.1 rpm)."""
+    """Return RPDO1: 6040h controlword, 6071h target torque (per mille), 60FFh target velocity (0.1 rpm)."""
     return struct.unpack("<Hhi", data)
 
 
 def enables(frame: Seen) -> bool:
-    """A setpoint that would move the shaft: the control word says "enable operation" (CiA 402)."""
+    """Return whether a setpoint enables the drive: its controlword is "enable operation" (CiA 402)."""
     return frame.identifier == RPDO1 and setpoint(frame.data)[0] & 0x0F == ENABLE_OPERATION

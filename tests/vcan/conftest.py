@@ -1,8 +1,8 @@
-"""Tests on a real SocketCAN interface: what they need, and what happens where it is missing.
+"""Tests on a real SocketCAN interface: their requirements, and the skip without them.
 
-The interface is the one named by TDHIL_VCAN (default vcan0). Where it is missing every test here is skipped and says
-how to run it. TDHIL_REQUIRE_VCAN=1, which run_in_guest.sh sets, turns that into a failure: where the interface was
-promised, nothing may pass by being skipped.
+TDHIL_VCAN names the interface (default vcan0). Without it every test here is skipped with instructions to run it.
+TDHIL_REQUIRE_VCAN=1, which run_in_guest.sh sets, turns the skip into a failure: with a promised interface, a skip must
+not count as a pass.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def interface() -> str:
 
 
 def what_is_missing(name: str) -> str | None:
-    """Why NAME can't be used, or None if it can. Flags, not operstate: a vcan that is up says "unknown" there."""
+    """Return why NAME cannot be used, or None. It reads flags, since the operstate of an active vcan is "unknown"."""
     link = Path("/sys/class/net") / name
     try:
         kind = int((link / "type").read_text())
@@ -43,7 +43,7 @@ def what_is_missing(name: str) -> str | None:
 
 def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("vcan")
-    item.add_marker("real_time")        # stepped or not: a drive whose host is silent for a second goes on without him
+    item.add_marker("real_time")        # a silent host counts as lost after a second
 
 
 def give_up(why: str) -> NoReturn:
@@ -60,7 +60,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """A quiet run hides the reasons of skipped tests; this one must be seen."""
+    """Print the reason of the skip, since a quiet run hides it."""
     skipped = [report for report in terminalreporter.stats.get("skipped", ()) if HOW in str(report.longrepr)]
     if skipped:
         why = what_is_missing(interface()) or "for want of tools"
@@ -69,13 +69,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture
 def vcan() -> str:
-    """Name of the interface, for python-can's `channel` and for can-utils."""
+    """Return the name of the interface, for python-can's `channel` and for can-utils."""
     return interface()
 
 
 @pytest.fixture
 def open_bus(vcan: str) -> Iterator[Callable[..., can.BusABC]]:
-    """Opens sockets on the interface; all are closed after the test."""
+    """Open sockets on the interface; all are closed after the test."""
     with ExitStack() as buses:
 
         def open_one(**options: object) -> can.BusABC:
@@ -86,7 +86,7 @@ def open_bus(vcan: str) -> Iterator[Callable[..., can.BusABC]]:
 
 @pytest.fixture
 def tool() -> Callable[[str], str]:
-    """The path of one of can-utils' programs; without it the test is given up as it is without the interface."""
+    """Return the path of a program of can-utils; without it the test is skipped as without the interface."""
 
     def find(name: str) -> str:
         return shutil.which(name) or give_up(f"{name} is not on PATH (apt-get install can-utils)")
@@ -96,7 +96,7 @@ def tool() -> Callable[[str], str]:
 
 @pytest.fixture
 def ip() -> str:
-    """ip(8), where links may be changed: in the guest we are root, elsewhere perhaps not."""
+    """Return ip(8) if links may be changed. This needs root, as in the guest."""
     from tests.vcan.vcan_runs import root_s_ip
 
     command = root_s_ip()

@@ -1,4 +1,4 @@
-"""The bus itself, before anything is built on it: what SocketCAN and python-can promise us on a real interface."""
+"""Bus alone: assumptions about SocketCAN and python-can on a real interface."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 
 Open = Callable[..., can.BusABC]
 Tool = Callable[[str], str]
-WAIT = 60.0  # s; for what must come
-QUIET = 0.2  # s; for what must not
+WAIT = 60.0  # s; for frames that must arrive
+QUIET = 0.2  # s; for frames that must not arrive
 
 
 def frame(can_id: int, data: bytes = b"", extended: bool = False) -> can.Message:
@@ -28,10 +28,10 @@ FRAMES = [
     frame(0x080),  # SYNC: no data at all
     frame(0x605, bytes.fromhex("4041600000000000")),  # SDO upload of the status word
     frame(0x7FF, bytes(range(8))),
-    frame(0x0, b"\xff", extended=True),  # the same number as NMT, yet another frame
+    frame(0x0, b"\xff", extended=True),  # the same number as NMT, but another frame
     frame(0x1ABCDEF0, b"\x10\x20\x30", extended=True),
     frame(0x1FFFFFFF, extended=True),
-    can.Message(arbitration_id=0x705, is_remote_frame=True, dlc=1, is_extended_id=False),  # node guarding's question
+    can.Message(arbitration_id=0x705, is_remote_frame=True, dlc=1, is_extended_id=False),  # request of node guarding
 ]
 
 
@@ -50,7 +50,7 @@ def receive(bus: can.BusABC, count: int) -> list[can.Message]:
 
 
 def listeners(vcan: str) -> int:
-    """How many sockets take every frame of the interface, as the kernel counts them."""
+    """Return the kernel's count of sockets that receive every frame of the interface."""
     rows = Path("/proc/net/can/rcvlist_all").read_text().splitlines()
     return sum(row.split()[:1] == [vcan] for row in rows)
 
@@ -79,7 +79,7 @@ def test_both_ways_in_order(open_bus: Open) -> None:
     assert [(m.arbitration_id, m.data[0]) for m in receive(one, 100)] == [(0x205, i) for i in range(100)]
 
 
-def test_own_frames_come_back_only_when_asked(open_bus: Open) -> None:
+def test_own_frames_return_on_request_only(open_bus: Open) -> None:
     deaf, hearing, other = open_bus(), open_bus(receive_own_messages=True), open_bus()
     deaf.send(frame(0x181, b"\x01"))
     receive(other, 1)
@@ -91,8 +91,8 @@ def test_own_frames_come_back_only_when_asked(open_bus: Open) -> None:
     assert not own.is_rx
 
 
-def test_is_rx_does_not_tell_our_own_frames(open_bus: Open) -> None:
-    """It says whether a frame was made on this host (MSG_DONTROUTE): another program's on it was too."""
+def test_is_rx_does_not_identify_our_own_frames(open_bus: Open) -> None:
+    """It shows whether a frame is from this host (MSG_DONTROUTE), which includes other programs on it."""
     one, other = open_bus(), open_bus()
     one.send(frame(0x181, b"\x01"))
     (got,) = receive(other, 1)
@@ -109,7 +109,7 @@ def test_filters_act_in_the_kernel(open_bus: Open) -> None:
 
 
 def test_time_stamps_are_wall_clock(open_bus: Open) -> None:
-    """The driver maps them to monotonic time; that rests on whose clock they are, and on their not going back."""
+    """The driver maps them to monotonic time. This assumes that they are wall clock and do not decrease."""
     one, other = open_bus(), open_bus()
     before = time.time()
     for i in range(50):
@@ -117,7 +117,7 @@ def test_time_stamps_are_wall_clock(open_bus: Open) -> None:
     after = time.time()
     stamps = [m.timestamp for m in receive(other, 50)]
     assert stamps == sorted(stamps)
-    # A microsecond of slack: the stamp's digits are cut when it becomes a float.
+    # Tolerance of a microsecond: the conversion to float truncates the time stamp.
     assert before - 1e-6 <= stamps[0]
     assert stamps[-1] <= after + 1e-6
 
@@ -129,7 +129,7 @@ def test_two_sockets_see_the_same_stamp(open_bus: Open) -> None:
 
 
 def test_a_burst_is_not_lost(open_bus: Open) -> None:
-    """A reader that sleeps through 200 frames still finds them all; a kernel's default buffer holds few more."""
+    """A reader that sleeps during 200 frames still receives them all. The default kernel buffer holds few more."""
     one, other = open_bus(), open_bus()
     for i in range(200):
         one.send(frame(0x185, bytes([i])))
@@ -147,12 +147,12 @@ while True:
 
 
 def test_a_killed_process_falls_silent(open_bus: Open, vcan: str) -> None:
-    """SIGKILL takes the socket along, and with it what the kernel sends on its behalf."""
+    """SIGKILL closes the socket and ends all transmission by the kernel on its behalf."""
     bus = open_bus()
     with subprocess.Popen([sys.executable, "-c", SENDER, vcan]) as sender:
         try:
             seen: set[int] = set()
-            end = time.monotonic() + WAIT  # a guest starts Python slowly
+            end = time.monotonic() + WAIT  # Python starts slowly in a guest
             while seen != {0x205, 0x77F} and time.monotonic() < end:
                 message = bus.recv(WAIT)
                 if message is not None:
@@ -161,7 +161,7 @@ def test_a_killed_process_falls_silent(open_bus: Open, vcan: str) -> None:
         finally:
             sender.kill()
     assert sender.returncode == -signal.SIGKILL
-    while bus.recv(0) is not None:  # what was sent before
+    while bus.recv(0) is not None:  # frames sent before
         pass
     assert bus.recv(QUIET) is None
 
@@ -170,7 +170,7 @@ LOG_LINE = re.compile(r"\((\d+\.\d+)\) (\S+) ([0-9A-F]{3}|[0-9A-F]{8})#(R?)([0-9
 
 
 def decode(line: str, vcan: str) -> tuple[float, tuple[int, bool, bool, int, bytes]]:
-    """`(1700000000.123456) vcan0 605#4041600000000000`, extended ids with eight digits, remote frames as `705#R1`."""
+    """Parse `(1700000000.123456) vcan0 605#4041600000000000`, 8-digit extended ids, remote frames as `705#R1`."""
     match = LOG_LINE.fullmatch(line)
     assert match, line
     stamp, channel, can_id, remote, rest = match.groups()
@@ -195,7 +195,7 @@ def test_candump_sees_what_we_send(open_bus: Open, vcan: str, tool: Tool) -> Non
     decoded = [decode(line, vcan) for line in log.splitlines()]
     assert [seen for _, seen in decoded] == [content(message) for message in FRAMES]
     stamps = [message.timestamp for message in receive(other, len(FRAMES))]
-    # The stamp is the frame's, not the reader's: another socket has the same one, to candump's six digits.
+    # The time stamp belongs to the frame, not to the reader: another socket has the same one, to six digits.
     assert [stamp for stamp, _ in decoded] == pytest.approx(stamps, abs=2e-6)
 
 

@@ -1,8 +1,8 @@
-"""Faults of the bus itself, made with can-utils and ip: a foreign master, a replay, lost frames, a bus that goes away.
+"""Faults of the bus, made with can-utils and ip: another master, a replay, lost frames, a lost interface.
 
-Stepped time; whatever happens, the true shaft must come to rest (the simulator's trace tells), the host must end by
-itself with an exit code of faults.md and no traceback, and the log must replay. (vcan knows no bit errors:
-error-passive and bus-off can't be made on it.)
+The tests use stepped time. With each fault, the true shaft must come to standstill in the simulator's trace. The host
+must end with an exit code of faults.md and without a traceback, and the log must replay. vcan has no bit errors, so
+error-passive and bus-off are not possible on it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def assert_told(done, by_itself, *codes) -> None:
 # -- a foreign master (cansend) --------------------------------------------------------------------------------
 
 
-def test_somebody_stops_the_node(tmp_path, vcan, tool):
-    """NMT stop: the drive hears no setpoint any more, not even a quick stop; its own watchdog brakes."""
+def test_a_foreign_nmt_stop(tmp_path, vcan, tool):
+    """After NMT stop the drive receives no setpoint and no quick stop. Its own watchdog brakes."""
     with simulated(tmp_path, vcan) as drive:
         done, by_itself = run_into(lambda: run(tool("cansend"), vcan, "000#0201"), tmp_path, drive, vcan)
         assert_safe(drive)
@@ -51,7 +51,7 @@ def test_a_second_station_under_the_drive_s_id(tmp_path, vcan, tool):
 
 
 def test_a_second_master_sends_setpoints_and_syncs(tmp_path, vcan, tool):
-    """9 rad/s wanted, enabled, and SYNCs of its own among ours: a few of them within a second of plant time."""
+    """It sends 9 rad/s with an enable word, and its own SYNCs: a few of them within a second of plant time."""
     velocity = round(9.0 / (0.1 * math.pi / 30.0))
     word = b"\x0f\x00" + b"\x00\x00" + velocity.to_bytes(4, "little")
     many = ("-g", "0", "-n", "10")
@@ -71,7 +71,7 @@ def test_a_second_master_sends_setpoints_and_syncs(tmp_path, vcan, tool):
 
 @pytest.mark.parametrize("times", [1, 20])
 def test_old_feedback_is_replayed(tmp_path, vcan, tool, times):
-    """The drive's own feedback, recorded in motion and played back at once while the run goes on."""
+    """The feedback of the drive is recorded in motion and replayed at once during the run."""
     with watching(tool("candump"), tmp_path / "candump.log", vcan) as candump, simulated(tmp_path, vcan) as drive:
 
         def replay():
@@ -90,13 +90,13 @@ def test_old_feedback_is_replayed(tmp_path, vcan, tool, times):
 
 @contextmanager
 def bridged(ip, cangw, vcan):
-    """A second interface for the drive, and the kernel's gateway between the two; yields its name and `only`."""
+    """Connect a second interface for the drive by the kernel's gateway; yield its name and `only`."""
     other = "vcan9"
     run(ip, "link", "add", other, "type", "vcan")
     run(ip, "link", "set", other, "up", "txqueuelen", "1000")
 
     def only(there=(), back=()):
-        """Both ways anew, with options of cangw's; None: nothing passes that way."""
+        """Replace both directions, with options of cangw; None: no frame passes in this direction."""
         run(cangw, "-F")
         for way, options in (((vcan, other), there), ((other, vcan), back)):
             if options is not None:
@@ -111,7 +111,7 @@ def bridged(ip, cangw, vcan):
 
 
 def but(identifier: int) -> tuple[str, str]:
-    """Every frame passes but those with this identifier."""
+    """Return options that pass every frame except for those with this identifier."""
     return "-f", f"{identifier:03X}~7FF"
 
 
@@ -128,12 +128,12 @@ def test_frames_are_lost_on_the_way(tmp_path, vcan, tool, ip, lost, there, back,
     assert_told(done, by_itself, *codes)
     if lost in ("all", "the host's heartbeat"):
         assert shaft.events("host heartbeat lost")
-        # Held until somebody comes; or the host, if it could, has seen it at rest and disabled it.
+        # Enabled until the next host, or disabled by this host after standstill.
         assert shaft.state[-1] in ("quick stop active", "switch on disabled")
 
 
-def test_setpoints_alone_are_lost(tmp_path, vcan, tool, ip):
-    """The drive goes on with its last one and hears no quick stop in that frame: an SDO ends it, or its watchdog."""
+def test_only_setpoints_are_lost(tmp_path, vcan, tool, ip):
+    """The drive keeps its last setpoint and receives no quick stop in this frame. An SDO or its watchdog ends it."""
     with bridged(ip, tool("cangw"), vcan) as (other, only), simulated(tmp_path, other) as drive:
         done, _ = run_into(lambda: only(but(0x201), ()), tmp_path, drive, vcan)
         shaft = assert_safe(drive)
@@ -146,11 +146,11 @@ def test_setpoints_alone_are_lost(tmp_path, vcan, tool, ip):
     assert shaft.state[-1] in ("quick stop active", "switch on disabled")
 
 
-# -- the bus goes away (ip link) -------------------------------------------------------------------------------
+# -- the interface is lost (ip link) -------------------------------------------------------------------------------
 
 
-def test_the_interface_goes_down_and_comes_back(tmp_path, vcan, tool, ip):
-    """An adapter unplugged: the host ends with 8, and when the bus is back nothing more is sent by anybody."""
+def test_the_interface_goes_down_and_up(tmp_path, vcan, tool, ip):
+    """The host ends with 8, as with an unplugged adapter. After the return of the bus it sends no more frames."""
     with simulated(tmp_path, vcan) as drive:
         try:
             done, by_itself = run_into(lambda: run(ip, "link", "set", vcan, "down"), tmp_path, drive, vcan)
@@ -163,8 +163,8 @@ def test_the_interface_goes_down_and_comes_back(tmp_path, vcan, tool, ip):
     assert_told(done, by_itself, 8)
 
 
-def test_the_interface_is_back_before_the_host_has_noticed(tmp_path, vcan, tool, ip):
-    """Down for a moment only: no setpoint that enables may follow; a new run is needed."""
+def test_the_interface_is_up_again_before_the_host_has_noticed(tmp_path, vcan, tool, ip):
+    """The interface is down briefly. No enabling setpoint may follow; a new run is needed."""
     back_s = []
 
     def blink():

@@ -1,7 +1,7 @@
-"""Of the contract of every Drive (tests/drivers/test_drive_contract.py), what a socket of the kernel could break.
+"""Part of the contract of every Drive (tests/drivers/test_drive_contract.py) that depends on a socket of the kernel.
 
-That is the order, the time and the content of the frames, and what is left in the drive behind them. The rest of the
-contract is the driver's own, whatever carries its frames: the benches of tests/drivers prove it.
+It is the order, the time and the content of the frames, and the remaining settings in the drive. The rest of the
+contract does not depend on the bus: the benches of tests/drivers test it.
 """
 
 from __future__ import annotations
@@ -39,13 +39,16 @@ def run(make_bench):
 
 
 def test_a_seed_repeats_a_run(make_bench):
-    """As in the contract, but for mode display and torque demand: they come with TPDO2, behind the feedback that ends
-    a cycle, and whether they are there at the next cycle is the kernel's business."""
+    """The run repeats as in the contract, except for mode display and torque demand.
+
+    They come with TPDO2 after the feedback that ends a cycle. The kernel determines whether they arrive before the next
+    cycle.
+"""
     def once(seed):
         run = Run(make_bench(RigParams(), seed=seed))
         run.turning(3.0)
         run.go(1.0, other_mode(run), 3.0, 100.0)
-        run.bench.close()              # one interface: two drives on it would be two nodes of one ID
+        run.bench.close()              # one interface: two drives would be two nodes with one ID
         return [sample._replace(mode=None, torque_demand_nm=None) for sample in run.samples]
 
     first = once(7)

@@ -1,9 +1,9 @@
-"""The five stages on a real SocketCAN interface: the same tests as over the other buses (tests/path).
+"""Five stages on a real SocketCAN interface: the same tests as over the other buses (tests/path).
 
-candump watches the whole run from outside. Its log, read by code of the tests' own, and the raw frames in run.mcap
-must be the same: every frame, its data, and the order of each sender's frames. (Between two senders the log has the
-order in which the host took them, the bus that in which they were sent.) In stepped time the log's times are control
-time: each SYNC one period after the one before. The wall's times are compared in test_silence.
+candump records the whole run. Its log, read by independent code, and the raw frames in run.mcap must be the same: every
+frame, its data, and the order of the frames of each sender. Between two senders, the log has the order of reception by
+the host, and the bus the order of transmission. In stepped time the times of the log are control time, with one period
+between SYNCs. test_silence compares times of the wall clock.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tdhil.recording.log_reader import read_frames
 from tests.path.five_stages import FiveStages, interrupted, over_a_peer
 from tests.vcan.candump_log import DRIVES, HOSTS, SYNC, TPDO1, watching
 
-RATE_HZ = 50.0         # a guest takes milliseconds for a cycle; the plant's time is the same at any rate
+RATE_HZ = 50.0         # a guest needs milliseconds per cycle; the plant time is the same at any rate
 MOSTLY = 0.99
 
 
@@ -32,13 +32,13 @@ def assert_log_is_what_was_on_the_bus(log: Path, seen: list) -> None:
 
     theirs = [(frame.identifier, frame.data) for frame in logged if not frame.outgoing]
     on_the_bus = [(frame.identifier, frame.data) for frame in seen if frame.identifier in DRIVES]
-    # Before the host came and after it had gone the drive said something too, to nobody.
+    # The drive also sent frames before the start and after the end of the host.
     begin = next(k for k, frame in enumerate(on_the_bus) if frame == theirs[0])
     assert on_the_bus[begin : begin + len(theirs)] == theirs
     assert len(on_the_bus) - len(theirs) <= 5
 
-    # The feedback comes behind the SYNC that asked for it, on the bus and in the log alike. On a starved machine one is
-    # late now and then: never so many that it matters.
+    # The feedback follows its SYNC, on the bus and in the log. On a loaded computer a frame is
+    # late occasionally, but too rarely to matter.
     for frames in (seen, logged):
         pairs = [frame.identifier for frame in frames if frame.identifier in (SYNC, TPDO1)]
         ahead = list(accumulate(1 if identifier == SYNC else -1 for identifier in pairs))

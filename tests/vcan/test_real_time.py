@@ -1,13 +1,12 @@
-"""Four runs in real time, at the rate that each of them chooses, against simulated drives in processes of their own.
+"""Four runs in real time, each at its chosen rate, with simulated drives in their own processes.
 
-A guest beside the other tests is a slow and a busy computer: late frames, bursts and stalls are to be expected. What
-must hold on any computer: a run gives J, covered by its interval or with none, or it ends with 5 and says that this
-computer was late; nobody else is blamed, and the shaft comes to rest. How many of a hundred longer ones come through
-on a computer that isn't overloaded, and how many cycles they miss, is measured by benchmarks/real_time_runs.py.
+A guest beside other tests is a slow and busy computer with late frames, bursts and stalls. On any computer, a run gives
+a covering interval of J or none, or it ends with 5 and reports that this computer was late. It names no other cause,
+and the shaft comes to standstill. benchmarks/real_time_runs.py measures the share of a hundred longer runs that
+complete on a normal computer, and their missed cycles.
 
-A run mostly waits, so that two go side by side, where root may make a second interface: each lane a process that is
-forked off this one (a guest starts programs slowly), with a drive and an interface of its own. The tests wait for the
-answers.
+A run mostly waits, so two run in parallel if root can make a second interface. Each lane is a fork of this process,
+since a guest starts programs slowly, with its own drive and interface. The tests wait for the results.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ FURTHER = ("vcan8",)
 SHORT = ("--mode", "speed", "--excitation", "sine", "--frequency", 1, "--periods", 12, "--offset", 5)
 """Twelve seconds of excitation at one mean speed."""
 LEVEL_S, FIRST_RAMP_S = 2.0, 4.0
-"""Of stage 2, instead of 6 and 8: what is rough of its inertia shows in a plan that is too cautious, and in no more."""
+"""Times of stage 2, instead of 6 and 8 s. A less accurate J only makes the plan more cautious."""
 A_RUN_S = 600.0
-"""Wall time after which a run is taken to hang, on a guest that is starved."""
+"""Wall time after which a run is considered hung, on a loaded guest."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """How one run ended, as its lane has seen it."""
+    """End of one run in its lane."""
 
     code: int
     err: str
@@ -52,7 +51,7 @@ class Answer:
 
 
 class Lane:
-    """Runs one after the other, in a process of its own."""
+    """Lane of consecutive runs in its own process."""
 
     def __init__(self, drive: Peer, folder: Path, numbers: range) -> None:
         self.drive, self.folder = drive, folder
@@ -60,7 +59,7 @@ class Lane:
         self._child.start()
 
     def answer(self, number: int) -> Answer:
-        """Waits for it."""
+        """Wait for the result and return it."""
         path = self.folder / f"{number}.json"
         wait_for(f"run {number}", lambda: path.exists() or not self._child.is_alive(), hangs_s=A_RUN_S)
         assert path.exists(), f"the lane ended before run {number}: exit {self._child.exitcode}"
@@ -77,7 +76,7 @@ class Lane:
         speed.LEVEL_S, speed.FIRST_RAMP_S = LEVEL_S, FIRST_RAMP_S
         for number in numbers:
             done = identify(self.folder, *self.drive.options, *SHORT, log=f"{number}.mcap")
-            # Stopped for lateness before anything has moved, it is a refusal, with a log of its own.
+            # A stop for lateness before motion is a refusal with its own log.
             log = self.folder / f"{number}.mcap"
             log = log if log.exists() else log.with_suffix(".refused.mcap")
             answer = self.folder / f"{number}.json"
@@ -91,7 +90,7 @@ class Lane:
 
 @contextmanager
 def further_interface(name: str) -> Iterator[list[str]]:
-    """One of our own, where links may be changed."""
+    """Make a further interface if links may be changed."""
     ip = root_s_ip()
     if ip is None or subprocess.run([ip, "link", "add", name, "type", "vcan"], check=False).returncode:
         yield []
@@ -104,7 +103,7 @@ def further_interface(name: str) -> Iterator[list[str]]:
 
 
 def go_first(drive: Peer) -> None:
-    """A real drive has a processor of its own, and isn't silent because the host's computer is busy."""
+    """Raise the priority of the simulated drive: a real drive has its own processor and never waits for the host."""
     for thread in Path(f"/proc/{drive.child.pid}/task").iterdir():
         with suppress(PermissionError):
             os.setpriority(os.PRIO_PROCESS, int(thread.name), -15)
@@ -130,7 +129,7 @@ def lanes(tmp_path_factory):
 
 
 @pytest.mark.parametrize("number", range(RUNS))
-def test_a_run_gives_its_result_or_says_that_this_computer_was_late(lanes, number):
+def test_a_run_gives_its_result_or_reports_that_this_computer_was_late(lanes, number):
     lane = lanes[number % len(lanes)]
     done = lane.answer(number)
     assert done.log.exists(), done.err

@@ -1,8 +1,8 @@
-"""A host that is frozen, seen from outside: candump shows that nothing of it goes on, and what comes when it wakes.
+"""Frozen host, recorded by candump: it sends no frames while frozen, and no stale setpoint afterwards.
 
-What would go on behind a frozen process is what the kernel sends for it (python-can's send_periodic on SocketCAN) or
-another process of its own. Real time, slow cycles and a long watchdog, for a loaded machine: what is asserted is order
-and content; wall times stand in bounds that only a lost frame or a wrong clock would break.
+Cyclic transmission of the kernel (python-can's send_periodic on SocketCAN) or of another process would continue for a
+frozen process. The tests use real time with slow cycles and a long watchdog, for a loaded computer. They check order
+and content, and wall times with bounds that only a lost frame or a wrong clock would exceed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from tests.vcan.vcan_runs import TURNING_RAD_S, assert_safe, simulated
 pytestmark = pytest.mark.usefixtures("no_bus_of_the_user")
 RATE_HZ = 4.0
 STAMP_S = 1.0 / RATE_HZ
-"""How far the log's time of a sent frame may lie from the kernel's stamp of it, all but one in twenty: one cycle."""
+"""Tolerance between the log's time of a sent frame and the kernel's time stamp, for 95 % of the frames: one cycle."""
 
 
 def lost(drive):
     return drive.shaft.events("host heartbeat lost")
 
 
-def test_a_frozen_host_is_silent_and_wakes_with_nothing_stale(tmp_path, vcan, tool):
+def test_a_frozen_host_is_silent_and_sends_no_stale_setpoint_afterwards(tmp_path, vcan, tool):
     rig = rig_file(tmp_path, f"rate_hz: {RATE_HZ}\n", PATIENT_LIMITS)
     on = ("-i", "socketcan", "-c", vcan)
     with watching(tool("candump"), tmp_path / "candump.log", vcan) as candump:
@@ -49,14 +49,14 @@ def test_a_frozen_host_is_silent_and_wakes_with_nothing_stale(tmp_path, vcan, to
     before = {frame.identifier for frame in seen if frame.stamp_s < frozen_s}
     assert {SYNC, RPDO1, HOST_BEAT} <= before
     frozen = [frame for frame in seen if frozen_s < frame.stamp_s < woken_s]
-    assert {frame.identifier for frame in frozen} <= DRIVES      # no heartbeat, no SYNC, no RPDO, no SDO of the host's
-    assert frozen                                                # candump saw the drive all the while
+    assert {frame.identifier for frame in frozen} <= DRIVES      # no heartbeat, SYNC, RPDO or SDO of the host
+    assert frozen                                                # candump recorded the drive all the time
     (lost_s,) = shaft.events("host heartbeat lost")
     assert shaft.at_rest_from() - lost_s <= shaft.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
 
     awake = [frame for frame in seen if frame.stamp_s > woken_s]
-    assert {frame.identifier for frame in awake} & HOSTS         # it did wake
-    # It may have been frozen with a setpoint in hand, past its last look at the clock. None acts without a SYNC.
+    assert {frame.identifier for frame in awake} & HOSTS         # it continued
+    # It may have been frozen with a prepared setpoint, after its last check of the clock. None acts without a SYNC.
     setpoint = None
     for frame in seen:
         setpoint = frame if frame.identifier == RPDO1 else setpoint
@@ -67,7 +67,7 @@ def test_a_frozen_host_is_silent_and_wakes_with_nothing_stale(tmp_path, vcan, to
     assert "Traceback" not in done.err
     assert tdhil("replay", done.log).code in (3, 9)
 
-    # Control time on the log's frames against the kernel's wall clock on the same ones, but for the constant between.
+    # Control time of the frames in the log and wall clock of the kernel agree, except for a constant.
     logged = [frame for frame in read_frames(done.log) if frame.outgoing]
     sent = [frame for frame in seen if frame.identifier in HOSTS]
     assert [(frame.identifier, frame.data) for frame in logged] == [(frame.identifier, frame.data) for frame in sent]

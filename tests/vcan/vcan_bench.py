@@ -1,4 +1,4 @@
-"""The bench of the Drive contract (tests/drivers) with driver, simulator and second station on a real interface."""
+"""Bench of the Drive contract (tests/drivers) with driver, simulator and second station on a real interface."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tests.rigs import QUIET_RIG
 
 RECEIVE_BYTES = 4 << 20
 RATE_HZ = 50.0
-"""A guest takes milliseconds for a cycle, whatever its period; what the contract asks for holds at every rate."""
+"""Rate of the bench. A guest needs milliseconds for any cycle, and the contract applies at every rate."""
 
 
 class VcanBench(CanopenBench):
-    """As CanopenBench, over SocketCAN; the simulator in a thread as the embedded one is."""
+    """Bench like CanopenBench, over SocketCAN, with the simulator in a thread like the embedded one."""
 
     LEAST_FRAMES = 800
 
@@ -31,7 +31,7 @@ class VcanBench(CanopenBench):
 
         self.limits, self.rated_nm, self.frames = LIMITS, 1000.0, []
         self._theirs, self._second = open_bus(), open_bus()
-        # The second station is asked seldom: what it has not fetched must find room.
+        # The second station is read rarely, so its buffer must hold unread frames.
         self._second.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         simulator = Simulator(
             self._theirs, params, seed=seed, stepped=True,
@@ -41,7 +41,7 @@ class VcanBench(CanopenBench):
         self._ended = threading.Event()
         self._thread = threading.Thread(target=simulator.run, args=(self._ended,), daemon=True)
         self._thread.start()
-        assert self._second.recv(10.0) is not None       # its boot-up, before the driver listens
+        assert self._second.recv(10.0) is not None       # its boot-up message, before the driver receives
         self.bus = TamperedBus(open_bus())
         self.drive = CanopenDrive(
             self.bus, load_canopen_profile(self.PROFILE), SteppedClock(), node=1, tap=self._tap, rate_hz=rate_hz,

@@ -1,4 +1,4 @@
-"""Runs on a real interface, host and simulated drive in this process: a guest starts programs slowly."""
+"""Runs on a real interface with host and simulated drive in this process, since a guest starts programs slowly."""
 
 from __future__ import annotations
 
@@ -30,39 +30,39 @@ from tests.path.path_runs import (
 )
 
 RATE_HZ = 25.0
-"""A guest takes milliseconds for a cycle; plant time is the same at any rate."""
+"""Rate of the runs. A guest needs milliseconds per cycle, and plant time is the same at any rate."""
 TURNING_RAD_S = 1.0
 FASTEST_RAD_S = 10.0                      # the simulated rig's speed window
 NOTICED_S = 30.0
-"""Of plant time: whatever the host has not noticed by then it does not notice."""
+"""Plant time after which a host that has not detected the fault never will."""
 
 
 def root_s_ip() -> str | None:
-    """ip(8), for root alone: nobody else may change links."""
+    """Return ip(8) for root, since other users may not change links."""
     return shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin") if os.geteuid() == 0 else None
 
 
 def run(*command: object) -> None:
-    """A tool of the system's; its complaint is the test's."""
+    """Run a system tool; its error fails the test."""
     done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=HANGS_S)
     assert done.returncode == 0, f"{command}: {done.stderr or done.stdout}"
 
 
 @dataclass
 class Drive(Traced):
-    """A simulated drive in a thread of the test."""
+    """Simulated drive in a thread of the test."""
 
     simulator: Simulator
 
     def rests(self) -> bool:
-        """It has been brought to rest, and has stood for more than a second of plant time."""
+        """Return whether the shaft is at standstill for more than a second of plant time."""
         shaft = self.shaft
         return bool(len(shaft.time_s)) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5
 
 
 @contextmanager
 def simulated(folder: Path, interface: str, *, stepped: bool = True) -> Iterator[Drive]:
-    """Stepped, a host that is silent for long counts as gone."""
+    """Yield a stepped drive for which a host counts as lost only after a long silence."""
     trace, ended = folder / "shaft.csv", threading.Event()
     with can.Bus(interface="socketcan", channel=interface) as bus:
         simulator = Simulator(bus, RigParams(), seed=1, trace=trace, stepped=stepped, silence_s=HANGS_S)
@@ -77,7 +77,7 @@ def simulated(folder: Path, interface: str, *, stepped: bool = True) -> Iterator
 
 
 def run_into(trouble: Callable[[], None], folder: Path, drive: Drive, interface: str) -> tuple[Finished, bool]:
-    """`tdhil identify`, with trouble as soon as the shaft turns; how it ended, and whether by itself or by Ctrl-C."""
+    """Run `tdhil identify` with a fault once the shaft turns; return its end, and whether it needed Ctrl-C."""
     over = threading.Event()
     found: dict[str, bool | BaseException] = {"by itself": True}
 
@@ -86,7 +86,7 @@ def run_into(trouble: Callable[[], None], folder: Path, drive: Drive, interface:
             wait_for("motion", lambda: drive.simulator.speed_rad_s > TURNING_RAD_S or over.is_set())
             if over.is_set():
                 return
-            drive.simulator._time.silence_s = 1.0           # from here on: he may be gone, and the drive has to see it
+            drive.simulator._time.silence_s = 1.0           # from here on the drive must detect a lost host
             trouble()
             due_s = drive.simulator.time_s + NOTICED_S
             wait_for("the end", lambda: over.is_set() or drive.simulator.time_s > due_s)
@@ -109,11 +109,11 @@ def run_into(trouble: Callable[[], None], folder: Path, drive: Drive, interface:
 
 
 def assert_safe(drive: Drive) -> Shaft:
-    """Whatever was done to the bus: at rest, never let go while turning, never backwards, never beyond the window."""
+    """Assert standstill, no disable in motion, no reverse rotation, and a speed within the window."""
     drive.shaft.assert_enabled(True)
     end_s = time.monotonic() + HANGS_S
     while not drive.rests():
-        assert time.monotonic() < end_s, "the shaft does not come to rest"
+        assert time.monotonic() < end_s, "the shaft does not come to standstill"
         time.sleep(0.1)
     shaft = drive.shaft
     shaft.assert_at_rest()
