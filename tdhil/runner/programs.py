@@ -144,6 +144,7 @@ def begin_motion(run: Run) -> None:
         torque_resolution_nm=preflight.torque_resolution_nm,
         torque_offset_nm=run.torque_offset_nm,
         watched=preflight.watched,
+        ends_off=preflight.quick_stop_holds is False,
     ))
     loop.guard.start_clock(loop.now_s)
     breakaway_nm = probe_sign(loop, limits, run.mode, preflight.speed_resolution_rad_s)

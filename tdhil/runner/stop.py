@@ -250,7 +250,10 @@ class StopReport:
 
 
 class StopSequence:
-    """Stop sequence of one run; it runs once, and later calls return its report. ``watched``: the watchdog is armed."""
+    """Stop sequence of one run; it runs once, and later calls return its report.
+
+    ``watched``: the watchdog is armed. ``ends_off``: the drive removes its torque at the end of its quick stop.
+    """
 
     def __init__(
         self,
@@ -263,6 +266,7 @@ class StopSequence:
         torque_resolution_nm: float = 0.0,
         torque_offset_nm: float = 0.0,
         watched: bool = True,
+        ends_off: bool = False,
     ) -> None:
         assumptions = assumptions or ControlAssumptions()
         self._loop = loop
@@ -275,6 +279,7 @@ class StopSequence:
         self._enough_s = 3.0 * ramp_s + 2.0 * self._settle_s + 1.0
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
         self._watched = watched
+        self._ends_off = ends_off
         self._string = None
         if limits.has_drill_string:
             self._string = StringReleaseLimits(
@@ -317,7 +322,7 @@ class StopSequence:
 
     def _sequence(self) -> StopReport:
         self._loop.guard.expected = None
-        self._loop.guard.observer.begin_stop()
+        self._loop.guard.observer.begin_stop(ends_off=self._ends_off)
         if self._loop.guard.observer.backwards or self._never_moved:
             coasted = self._coasted()
             if coasted is not None:
@@ -392,6 +397,7 @@ class StopSequence:
     def _release(self, string: StringReleaseLimits) -> None:
         """Yield to the trapped torque until it is released or the limits of the release are reached."""
         going = StringRelease(string, self._at_rest_rad_s, self._loop.period_s)
+        noise = CountsOfNoise(self._loop.guard.observer, self._at_rest_rad_s)
         command = _REST
         while not (going.done or going.failed or self._speed_doubted):
             sample = self._exchange(command)
@@ -406,10 +412,13 @@ class StopSequence:
             self._ask_position(sample.time_s)
             if self._loop.guard.observer.runs_away(sample):
                 break
-            speed = going.step(sample.torque_nm, sample.speed_rad_s, sample.position_rad)
+            explained = noise.explains(sample.speed_rad_s, quiet=abs(sample.speed_rad_s) <= self._at_rest_rad_s)
+            if not explained:
+                noise.restart()
+            speed = going.step(sample.torque_nm, sample.speed_rad_s, sample.position_rad, noise=explained)
             command = Command(Mode.SPEED, speed, 0.0)
         self._trapped_nm = going.trapped_nm
-        if going.failed:
+        if going.failed and abs(going.torque_nm) > string.residual_nm:
             self._trouble.append(
                 f"trapped torque did not come down: {in_nm(going.trapped_nm)} at first, {in_nm(going.torque_nm)}"
                 f" after {going.travel_rad:.1f} rad"
@@ -437,6 +446,8 @@ class StopSequence:
             sample = self._exchange(Command(Mode.TORQUE, 0.0, torque_nm))
             waited_s += self._loop.period_s
             if torque_nm == 0.0:
+                if without_s == 0.0:
+                    self._held.clear()         # a mean of zero torque alone, for a report with noise
                 without_s += self._loop.period_s
             if sample is None:
                 if self._silent >= self._enough_silent:
@@ -445,10 +456,13 @@ class StopSequence:
             other_mode = sample.mode is not Mode.TORQUE and waited_s > MODE_S
             if sample.state is not PowerState.ENABLED or other_mode:
                 return None
-            held_nm = abs(sample.torque_nm - string.torque_offset_nm)
             if not self._speed_doubted:
                 return self._coasted()
-            if without_s > TORQUE_GONE_S and held_nm > 2.0 * string.residual_nm:
+            held_nm = math.fsum(self._held) / max(1, len(self._held)) - string.torque_offset_nm
+            if without_s > TORQUE_GONE_S and abs(held_nm) > 2.0 * string.residual_nm:
+                self._trouble.append(
+                    f"the drive still reports {in_nm(held_nm)} {without_s:.1f} s after zero torque was commanded: quick"
+                    " stop instead")
                 return None
         why = f" ({observer.doubt.what})" if observer.doubt is not None else ""
         self._trouble.append(

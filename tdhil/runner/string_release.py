@@ -147,10 +147,12 @@ class StringRelease:
         """Return whether its limits in time or travel are reached."""
         return self._time_s > self.longest_s or abs(self.travel_rad) > TRAVEL_RAD
 
-    def step(self, torque_nm: float, speed_rad_s: float, position_rad: float | None = None) -> float:
+    def step(
+        self, torque_nm: float, speed_rad_s: float, position_rad: float | None = None, *, noise: bool = False,
+    ) -> float:
         """Return the next speed setpoint, rad/s, from the last report; a value that is not finite counts as missing.
 
-        ``position_rad``: position of the cycle, if the drive reports one.
+        ``position_rad``: position of the cycle, if the drive reports one. ``noise``: a speed above standstill is noise.
         """
         self._time_s += self._period_s
         if not (math.isfinite(torque_nm) and math.isfinite(speed_rad_s)):
@@ -162,7 +164,7 @@ class StringRelease:
         if self._reference_nm is None:
             self._reference_nm, self.trapped_nm = abs(held_nm), held_nm
         self._reference_nm = max(0.0, self._reference_nm - self._limits.ramp_nm_s * self._period_s)
-        still = abs(speed_rad_s) <= self._at_rest_rad_s
+        still = noise or abs(speed_rad_s) <= self._at_rest_rad_s
         turned = None not in (position_rad, self._position_rad) and position_rad != self._position_rad
         self._position_rad = position_rad
         self._still_s = self._still_s + self._period_s if still and not turned else 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import replace
 
 import pytest
@@ -171,6 +172,41 @@ def test_a_drive_that_trips_and_shows_zero_at_once_confirms_nothing(world, state
     report = trips(lost, state, sees=0.0)
     assert not report.confirmed and report.at_rest_s is None
     assert trips(alive, state).confirmed
+
+
+class EndsOff(Removing):
+    """Drive that removes its torque at the end of its quick stop. Its reported speed lags by ``lag_s``."""
+
+    lag_s, seen_rad_s, trips_at_rad_s = 0.4, 0.0, 0.0
+
+    def report(self):
+        if self.state is PowerState.QUICK_STOP and self.speed <= self.trips_at_rad_s:
+            self.state = self.wish = PowerState.OFF
+            self.sees = 0.0 if self.trips_at_rad_s else None
+        true = self.speed if self.sees is None else self.sees
+        self.seen_rad_s += (true - self.seen_rad_s) * PERIOD_S / self.lag_s
+        return super().report()._replace(speed_rad_s=self.seen_rad_s)
+
+
+def interrupted(world, trips_at_rad_s):
+    """Stop a drive of this kind before J is known."""
+    here = world(EndsOff(), LIMITS)
+    here.drive.trips_at_rad_s = trips_at_rad_s
+    here.turn(5.0)
+    here.bench.hold(Command(Mode.SPEED, 5.0, 0.0), 3.0)
+    return here.stop_sequence(ends_off=True).run()
+
+
+def test_a_quick_stop_that_ends_with_the_torque_off_is_confirmed_before_j_is_known(world):
+    """The lagging report still shows speed when the drive removes its torque: Ctrl-C in stage 2 was "not confirmed"."""
+    report = interrupted(world, 0.0)
+    assert report.confirmed, report.trouble
+
+
+@pytest.mark.parametrize("trips_at_rad_s", [4.0, 2.5])
+def test_a_trip_within_the_ramp_whose_speed_is_lost_is_not_confirmed(world, trips_at_rad_s):
+    report = interrupted(world, trips_at_rad_s)
+    assert not report.confirmed and report.at_rest_s is None
 
 
 def test_a_drive_that_stays_in_its_fault_reaction_is_not_disabled(world):
@@ -355,6 +391,19 @@ def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
     assert here.drive.commands[-1].torque_nm == 0.0
     assert abs(here.drive.disabled_at[0]) < 0.05, "friction has enough time to stop it"
     assert any("standstill was not seen" in line for line in report.trouble)
+
+
+def test_noise_of_the_torque_report_does_not_end_the_run_out(world):
+    """One sample beyond 4 % of the limit gave the turning shaft back to speed control, without its speed signal."""
+    noise = random.Random(1)
+    here = known(world, limits=STRING)
+    here.drive.sees = 0.0
+    doubted(here)
+    here.drive.pushes_nm = 300.0
+    here.drive.misbehave = lambda drive, one: one._replace(torque_nm=one.torque_nm + noise.gauss(0.0, 8.0))
+    report = here.stop_sequence().run()
+    assert not report.confirmed and "quick_stop" not in here.drive.calls
+    assert abs(here.drive.disabled_at[0]) < 0.05
 
 
 def test_a_drive_that_does_not_follow_torque_mode_gets_the_quick_stop(world):

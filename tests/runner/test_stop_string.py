@@ -1,6 +1,7 @@
 """Stop with a drill string: the trapped torque falls on the ramp, and a twisted string is never disabled."""
 
 import math
+import random
 from dataclasses import replace
 
 import pytest
@@ -11,6 +12,7 @@ from drivers.drive import Check, Command, Identity, Mode, Outcome, PowerState
 from drivers.errors import DriveFault, LimitHit, PreflightRefused
 from tdhil.runner.preconditions import refuse_with_string
 from tdhil.runner.settings import ExcitationRequest
+from tdhil.runner.standstill import standstill_speed
 from tdhil.runner.stop import BLOCK_S, LONGEST_S, MODE_S, StopTimeout
 from tdhil.runner.string_release import (
     FASTEST_SWING_S,
@@ -473,3 +475,19 @@ def test_a_late_change_to_speed_mode_does_not_drop_the_torque_of_the_string():
     asked = [one.torque_nm for one in here.drive.commands[begun:]]
     assert asked[:late] == [300.0] * late
     assert asked[late + 1] == 0.0
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03])
+def test_counts_of_a_noisy_speed_do_not_prolong_the_release(share):
+    """One count restarted the time of quiet: the stop took 123 s, and reported 0 N·m as torque that did not fall."""
+    noise, took_s, reports = random.Random(2), [], []
+    for counts in (0.0, 1.05):
+        here = StringWorld(replace(STRING, quick_stop_rad_s2=2.0), twist_nm=300.0, stiffness=30.0)
+        size = counts * standstill_speed(here.limits, 0.01)
+        here.drive.misbehave = lambda drive, one, size=size: one._replace(
+            speed_rad_s=one.speed_rad_s + (noise.choice((-1, 1)) * size if noise.random() < share else 0.0))
+        begun_s = here.bench.now_s
+        reports.append(here.stop_sequence().run())
+        took_s.append(here.bench.now_s - begun_s)
+    assert all(one.confirmed and not one.trouble for one in reports), reports
+    assert took_s[1] < took_s[0] + 10.0

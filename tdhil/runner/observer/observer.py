@@ -90,6 +90,7 @@ class Observer:
         self._rules = rules(limits, self._still_rad_s, self._lag_s, self._point_s)
         self._revival: Revival | None = None
         self._angle_revival: Revival | None = None
+        self._ramp: Revival | None = None          # speed since the begin of a quick stop that ends with the torque off
         self.torque_offset_nm = 0.0
         """Reported torque without any torque, N·m."""
         self.swinging_offset_nm = 0.0
@@ -324,8 +325,13 @@ class Observer:
 
     # -- a stop that has no effect ------------------------------------------------------------------------------
 
-    def begin_stop(self) -> None:
-        """Note that a quick stop was requested: the shaft must decelerate from now on."""
+    def begin_stop(self, *, ends_off: bool = False) -> None:
+        """Note that a quick stop was requested: the shaft must decelerate from now on.
+
+        ``ends_off``: the drive removes its torque itself at the end of its quick stop.
+        """
+        if ends_off and self._ramp is None:
+            self._ramp = Revival(True, math.inf, self._limits.quick_stop_rad_s2, self._still_rad_s)
         # the speed before the effect of a contradiction
         earlier = (point.speed for point in self._points if self._time_s - point.time_s <= BEFORE_S)
         self._runaway.begin(next(earlier, 0.0))
@@ -400,8 +406,9 @@ class Observer:
         elif not self._moved and sample.state is PowerState.ENABLED:
             self._unseen_nms += abs(point.torque) * block_s
             self._unseen_nm = max(self._unseen_nm, abs(point.torque))
-        if self._revival is not None:
-            self._revival.see(point.time_s, point.speed)
+        for followed in (self._revival, self._ramp):
+            if followed is not None:
+                followed.see(point.time_s, point.speed)
         if self._angle_revival is not None and (rate := self._angles.rate_rad_s) is not None:
             self._angle_revival.see(point.time_s, rate)
         self._contradict(self._runaway.unanswered(point))
@@ -419,7 +426,7 @@ class Observer:
         if sample.state in (PowerState.ENABLED, PowerState.QUICK_STOP):
             self._powered = True
             self._compare(point, command, block_s)
-        elif self._left_operation_in_motion(point.time_s) or sample.state is PowerState.FAULT_REACTION:
+        elif self._left_operation_in_motion(point, sample.state) or sample.state is PowerState.FAULT_REACTION:
             self._contradict(self._balance.see(self._points, known, self._noise_rad_s()))
         if (apart := self._torques.see(command, sample, self.torque_offset_nm, block_s)) is not None:
             self._doubt(frozenset({Signal.TORQUE}), *apart, sample.time_s)
@@ -465,19 +472,20 @@ class Observer:
         margin = half + FRICTION_LIMIT_SHARE * self._limits.torque_nm
         point.load_low, point.load_high = middle - margin, middle + margin
 
-    def _left_operation_in_motion(self, now_s: float) -> bool:
+    def _left_operation_in_motion(self, point: Point, state: PowerState) -> bool:
         """Return whether the drive left operation by itself while the shaft turned: it removed its torque, or brakes
         after a fault.
 
         A drive whose sensor failed with it, or that reports no speed without torque, shows zero at once, or falls to it
         with its lag. While J is not known, the speed is in doubt until it falls gradually after every lag has ended
         (`Revival`), or has been braked by the reported torque. A fault reaction counts from its beginning: at its end
-        the lagging speed has little left to fall.
+        the lagging speed has little left to fall. The end of a quick stop that removes the torque is no such case.
         """
+        now_s = point.time_s
         if self._powered:
             self._powered = False
             recent = (one.speed for one in self._points if now_s - one.time_s <= POWER_LOSS_S)
-            if any(map(self.turns, recent)):
+            if any(map(self.turns, recent)) and (self._bounds.known or not self._at_end_of_ramp(point, state)):
                 self._left = LeftOperation(self._points[-1])
                 if not self._bounds.known:
                     self._contradict(Contradiction(
@@ -485,6 +493,19 @@ class Observer:
                         " not known yet", "Look at the shaft: the drive may report no speed without torque", now_s,
                         lag_hides=True))
         return self._left is not None
+
+    def _at_end_of_ramp(self, point: Point, state: PowerState) -> bool:
+        """Return whether a quick stop that ends with the torque off has brought the speed down along its ramp.
+
+        The lag of the report hides the last part of the ramp. A trip in that part whose speed signal is lost with it is
+        not told from the end: without a fault, and within the lag, it would turn the shaft at `quick_stop_rad_s2` times
+        the lag at most.
+        """
+        ramp = self._ramp
+        if ramp is None or state is not PowerState.OFF or not (ramp.falling or ramp.alive):
+            return False
+        hidden_rad_s = RAMP_SLACK * self._limits.quick_stop_rad_s2 * self._lag_s
+        return abs(point.speed) <= hidden_rad_s + 2.0 * self._still_rad_s
 
     def _compare(self, point: Point, command: Command, block_s: float) -> None:
         """Test the momentum balance, and whether the speed responds to the torque."""
