@@ -63,6 +63,7 @@ from drivers.drive import (
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.own_limits import OwnLimits
 from drivers.preflight import PreflightTable
+from drivers.standstill import standstill_limit_rad_s
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS, MessageCode
 from profiles.cia402 import Cia402Profile
@@ -422,12 +423,15 @@ class Cia402Drive:
         # Frames that came since the last cycle are checked before this cycle's setpoint is sent.
         now_s = bus.begin(not enabled and not ready.armed)
         if self._standing.by_object or not power.fed:
-            # The cyclic setpoints are disabled, or the drive is left to its own watchdog. In the second case nothing is
-            # sent. In stepped time the cycle is still started, because it advances time.
+            # The cyclic setpoints are disabled, or the drive is left to its own watchdog. In the second case no cyclic
+            # frame is sent. In stepped time the cycle is still started, because it advances time.
             fed = power.fed
             if fed:
-                self._standing.push(reported.state, power.wish, removes_torque=power.removes_torque)
-            return self._judge(now_s, bus.receive(now_s, fed or self.clock.stepped))
+                self._push_object()
+            sample = self._judge(now_s, bus.receive(now_s, fed or self.clock.stepped))
+            if not fed and self._may_disable_unfed(sample):
+                self._push_object()        # an object feeds no watchdog
+            return sample
         mode = self._mode
         mode.cycles += 1
         again = code != reported.shown_code and mode.cycles >= REPEAT_MODE_CYCLES
@@ -450,6 +454,22 @@ class Cia402Drive:
         elif (sample.fresh or bus.others_drive) and self._standing.undone(now_s, reported.state, bus.others_drive):
             self._stand()
         return sample
+
+    def _push_object(self) -> None:
+        """Send one object towards the request, without waiting for the answer."""
+        power = self._power
+        self._standing.push(self._reported.state, power.wish, removes_torque=power.removes_torque)
+
+    def _may_disable_unfed(self, sample: Sample) -> bool:
+        """Return whether to disable a drive that is left to its watchdog: at standstill, or to remove its torque.
+
+        A shaft that still turns is left to the reaction of the watchdog: without torque it would coast.
+        """
+        power = self._power
+        if power.wish is not PowerRequest.OFF or not sample.fresh:
+            return False
+        limit_rad_s = standstill_limit_rad_s(self._prepared.units.speed_rad_s_per_lsb)
+        return power.removes_torque or abs(sample.speed_rad_s) <= limit_rad_s
 
     def _stand(self) -> None:
         """Write quick stop as an object and disable all cyclic setpoints, because another master reversed the quick
@@ -612,7 +632,10 @@ class Cia402Drive:
         return found
 
     def stop_feeding(self) -> None:
-        """Send no sign of life, setpoint or controlword any more; see `drivers.drive.StopsFeeding`."""
+        """Send no sign of life or setpoint any more; see `drivers.drive.StopsFeeding`.
+
+        The controlword is sent as an object only, to disable the drive; an object feeds no watchdog.
+        """
         self._power.fed = False
         self._bus.stop_feeding()
 

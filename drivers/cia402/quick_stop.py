@@ -3,16 +3,19 @@
 It is written as an object (6040h, bit 2 low), which needs no mapping and no cycle. If the quick stop of the drive is
 set to coast (605Ah = 0), another option is written first; if the drive refuses it, the halt bit is used. In torque mode
 the drive gets speed mode at zero first, as in a run. Otherwise the quick stop could release a turning shaft. This step
-is left out if the profile states that the quick stop decelerates in torque mode.
+is left out if the profile states that the quick stop decelerates in torque mode, or that the mode does not change while
+the drive is enabled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
+from functools import partial
 
 from drivers.cia402.limits import QUICK_STOP_OPTION
 from drivers.cia402.objects import Objects
+from drivers.cia402.polling import ANSWER_S
 from drivers.cia402.position import find_angle
 from drivers.cia402.preflight import read_identity, speed_unit
 from drivers.cia402.process_data import TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL
@@ -137,20 +140,24 @@ class Cia402Target:
     def ask(self, attempt: int) -> None:
         """Write the quick stop as an object, after the bus's own means for this attempt.
 
-        The controlword itself is written even if the drive refuses the rest, or does not answer. Raises
+        Each step is taken even if the drive refuses an earlier one, or does not answer it. After a missing answer the
+        steps before the controlword wait `ANSWER_S` only, because they delay it. Raises the first error:
         CommunicationLost, ObjectRefused or DriveFault.
         """
         failed: CommunicationLost | ObjectRefused | DriveFault | None = None
-        try:
-            if not self._prepared:
-                self._prepare()
-            self._leave_torque_mode()
-            self.enforce(attempt)
-        except (CommunicationLost, ObjectRefused, DriveFault) as error:
-            failed = error
-        self._objects.write(_CONTROLWORD, 0, self._word_now(), 16)
+        last = self._write_controlword
+        for step in (self._prepare, self._leave_torque_mode, partial(self.enforce, attempt), last):
+            hurries = isinstance(failed, CommunicationLost) and step is not last
+            try:
+                with self._objects.answered_within(ANSWER_S) if hurries else nullcontext():
+                    step()
+            except (CommunicationLost, ObjectRefused, DriveFault) as error:
+                failed = failed or error
         if failed is not None:
             raise failed
+
+    def _write_controlword(self) -> None:
+        self._objects.write(_CONTROLWORD, 0, self._word_now(), 16)
 
     def _word_now(self) -> int:
         """Return the controlword. The halt bit acts in operation only, and its word would enable any other drive."""
@@ -218,12 +225,14 @@ class Cia402Target:
         return PositionSource(angle.rad_per_count, lambda: angle.read(self._objects, self._clock, 0.0))
 
     def _prepare(self) -> None:
+        """Clear a torque offset, and change a quick stop that coasts; once."""
+        if self._prepared:
+            return
         offset = self._profile.torque_offset
         if offset is not None and self._objects.read_if_there(offset.index, offset.sub):
             with suppress(ObjectRefused):          # possibly left by a host that died; cleared first
                 self._objects.write(offset.index, offset.sub, 0, 16)
         option = self._objects.read_if_there(QUICK_STOP_OPTION, signed=True)
-        self._prepared = True
         if option == QUICK_STOP_COASTS:
             try:
                 self._objects.write(QUICK_STOP_OPTION, 0, _BRAKE_AND_HOLD, 16)
@@ -231,12 +240,14 @@ class Cia402Target:
             except ObjectRefused:
                 self._word = ENABLE_OPERATION | HALT
                 self._said.append("its quick stop is set to coast (605Ah = 0): the halt bit was used instead")
+        self._prepared = True
         self.keep_time()
 
     def _leave_torque_mode(self) -> None:
         """Switch to speed mode at zero (60FFh, then 6060h) and wait up to `MODE_S` for 6061h; only if needed.
 
-        A drive that does not follow gets the quick stop anyway: the bus offers nothing better.
+        A drive that does not follow, or does not change its mode while enabled, gets the quick stop anyway: the bus
+        offers nothing better.
         """
         profile = self._profile
         if profile.quick_stop.decelerates_in_torque_mode or self._stays_in_torque_mode:
@@ -249,18 +260,24 @@ class Cia402Target:
             return
         if decode(self._objects.read(0x6041)) is not State.OPERATION_ENABLED:
             return
+        if not profile.modes.switch_while_enabled:
+            self._stay_in_torque_mode()
+            return
         self._objects.write(0x60FF, 0, 0, 32)
         self._objects.write(0x6060, 0, speed_modes[0], 8)
         deadline_s = self._clock.now_s() + MODE_S
         while self._shown() not in profile.modes.speed:
             if self._clock.now_s() > deadline_s:
-                self._stays_in_torque_mode = True
-                self._said.append("it stays in torque mode, where its quick stop may not brake the shaft")
+                self._stay_in_torque_mode()
                 return
             self.wait(MODE_PAUSE_S)
         said = "it was in torque mode, where its quick stop may not brake: speed mode at zero came first"
         if said not in self._said:
             self._said.append(said)
+
+    def _stay_in_torque_mode(self) -> None:
+        self._stays_in_torque_mode = True
+        self._said.append("it stays in torque mode, where its quick stop may not brake the shaft")
 
     def _shown(self) -> int:
         return self._objects.read(0x6061, signed=True)

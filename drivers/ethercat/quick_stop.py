@@ -31,8 +31,7 @@ class EthercatTarget(Cia402Target):
 
     def enforce(self, attempt: int) -> None:
         """Take the slave out of OP if the quick stop by SDO has no effect."""
-        if attempt > BY_SDO_TRIES and self._station.al_status().state == OP:
-            self._station.ask_for(SAFE_OP)
+        if attempt > BY_SDO_TRIES and self._station.al_status().state == OP and self._station.ask_for(SAFE_OP):
             self._said.append("setpoints of another master reversed the quick stop: the drive was put into SAFE-OP")
 
 

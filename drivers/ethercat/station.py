@@ -92,24 +92,37 @@ class Station(ABC):
         status = int.from_bytes(data[:2], "little")
         return AlStatus(status & 0xF, bool(status & ERROR_OR_ACKNOWLEDGE), int.from_bytes(data[4:6], "little"))
 
-    def ask_for(self, state: int) -> None:
-        """Request an AL state without waiting. An error of the slave is acknowledged first."""
+    def ask_for(self, state: int) -> bool:
+        """Request an AL state without waiting. Return False if the slave shows an error.
+
+        Then only the error is acknowledged, and the state must be requested again once the error is cleared. AL control
+        holds one request: a slave ignores a write that comes before its firmware has read the last one.
+        """
         found = self.al_status()
         if found.error:
             self.write(AL_CONTROL, (found.state | ERROR_OR_ACKNOWLEDGE).to_bytes(2, "little"))
-        self.write(AL_CONTROL, state.to_bytes(2, "little"))
+        else:
+            self.write(AL_CONTROL, state.to_bytes(2, "little"))
+        return not found.error
 
     def reach(self, state: int, keep_on: Callable[[], None] | None = None) -> None:
-        """Request an AL state and wait for it; ``keep_on`` is called meanwhile. Raises DriveFault if refused."""
-        self.ask_for(state)
+        """Request an AL state and wait for it; ``keep_on`` is called meanwhile.
+
+        An error that the slave shows before the request is acknowledged. Raises DriveFault if the slave refuses the
+        state, or is not there after `STATE_S`.
+        """
+        asked = self.ask_for(state)
         end_s = time.monotonic() + STATE_S
         while True:
             if keep_on is not None:
                 keep_on()
             found = self.al_status()
-            if found.state == state and not found.error:
-                return
-            if found.error or time.monotonic() > end_s:
+            if not found.error:
+                if found.state == state:
+                    return
+                if not asked:
+                    asked = self.ask_for(state)
+            if (found.error and asked) or time.monotonic() > end_s:
                 raise DriveFault(
                     f"the drive does not change to {state_name(state)}: it shows {found.text}", where=self.place,
                     next_step="See the manual of the drive for this AL status code: mapping, watchdog, cycle or clock",

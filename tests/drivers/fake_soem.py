@@ -19,9 +19,13 @@ class WkcError(Exception):
 
 
 class FakeSlave:
-    """One slave of a `FakeMaster`."""
+    """One slave of a `FakeMaster`.
 
-    def __init__(self, params=QUIET_RIG, seed=0, *, clocks=False, alias=0):
+    ``latency``: number of datagrams after which the firmware reads AL control. A write before is ignored and kept in
+    ``ignored``, as by the ESC of Beckhoff (register 0120h behaves like a mailbox).
+    """
+
+    def __init__(self, params=QUIET_RIG, seed=0, *, clocks=False, alias=0, latency=0):
         self.drive = MemoryDrive(params, seed)
         application = self.drive.application
         self.name, self.man, self.id, self.rev = "fake", 1, 2, 3
@@ -44,6 +48,7 @@ class FakeSlave:
         self.answers, self.heard, self.silent_s = [], [], 0.0
         self.lost, self.dead, self.mute, self.sync0 = 0, False, False, []
         self.segments = b""
+        self.latency, self.wanted, self.waits, self.ignored = latency, None, 0, []
 
     def number(self, offset, value=None, size=2):
         if value is not None:
@@ -71,6 +76,7 @@ class FakeSlave:
     def _fprd(self, address, size, timeout_us=2000):
         if self.dead:
             raise WkcError
+        self.firmware()
         self.memory[0x080D] = 8 if self.answers and not self.mute else 0
         if address == 0x1300:
             self.input = self.reported()
@@ -86,6 +92,7 @@ class FakeSlave:
     def _fpwr(self, address, data, timeout_us=2000):
         if self.dead:
             raise WkcError
+        self.firmware()
         self.memory[address : address + len(data)] = data
         if address == OUT:
             length, _, kind = struct.unpack_from("<HxxxB", data)[0], None, data[5]
@@ -93,13 +100,25 @@ class FakeSlave:
             self.heard.append((0, message))
             assert (kind, message[7] >> 4, len(data)) == (3, 2, SIZE)
             self.answer(message[8:])
-        if address == 0x0120:
-            wanted = data[0]
-            if wanted & 0x10:
-                self.number(0x0130, self.state & 0xF)
-                self.number(0x0134, 0)
-            elif self.state & 0x10 == 0:
-                self.number(0x0130, wanted & 0xF)
+        if address == 0x0120 and self.wanted is not None:
+            self.ignored.append(data[0])
+        elif address == 0x0120:
+            self.wanted, self.waits = data[0], self.latency
+            if not self.latency:
+                self.firmware()
+
+    def firmware(self):
+        """Let the firmware handle AL control when it is due, and count a datagram otherwise."""
+        wanted = self.wanted
+        if wanted is None or self.waits:
+            self.waits -= wanted is not None
+            return
+        self.wanted = None
+        if wanted & 0x10:
+            self.number(0x0130, self.state & 0xF)
+            self.number(0x0134, 0)
+        elif self.state & 0x10 == 0:
+            self.number(0x0130, wanted & 0xF)
 
     # -- CoE -------------------------------------------------------------------------------------------------
 

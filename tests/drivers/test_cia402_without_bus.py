@@ -84,6 +84,11 @@ def test_a_host_that_feeds_no_more_leaves_the_shaft_to_the_watchdog(run):
     braked = next(one for one in samples if one.state is PowerState.QUICK_STOP)
     assert braked.time_s - samples[0].time_s == pytest.approx(run.bench.limits.watchdog_s, abs=0.02)
     assert abs(run.bench.true_speed_rad_s) < 0.01
+    run.bench.frames.clear()
+    run.drive.disable()
+    run.until(lambda sample: sample.state is PowerState.OFF, 0.1)
+    assert not any(frame.outgoing for frame in run.bench.frames)         # 6040h was written as an object
+    assert run.bench.memory.silent_s > run.bench.limits.watchdog_s
 
 
 def test_a_quick_stop_that_another_master_reverses_is_written_as_an_object(run):

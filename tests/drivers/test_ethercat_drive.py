@@ -164,6 +164,30 @@ def test_after_stop_feeding_no_setpoint_is_sent_but_feedback_comes(turning, monk
     turning.drive.poll()
     assert [identifier for identifier, _ in turning.bench.heard() if identifier in (2, 3)] == []
     assert turning.bench.slave.drive.data[0x5FFE, 2] == b"\0"    # the simulated drive goes on in its own time
+    turning.drive.quick_stop()
+    turning.bench.slave.fall(4, 0x001B)
+    assert error_of(turning).entry is MessageCode.WATCHDOG_ACTED
+    turning.drive.disable()
+    turning.go(0.1)
+    assert abs(turning.bench.true_speed_rad_s) > 0.1
+    assert turning.samples[-1].state is PowerState.QUICK_STOP    # without torque it would coast
+    turning.bench.slave.advance(5.0)
+    turning.until(lambda sample: sample.state is PowerState.OFF, 0.1)
+    heard = turning.bench.heard()
+    assert {identifier for identifier, _ in heard} == {0, 1}     # only process data feed the watchdog
+    turning.go(0.1)
+    assert turning.bench.heard() == []
+
+
+def test_after_stop_feeding_the_torque_is_removed_at_any_speed(turning, monkeypatch):
+    monkeypatch.setattr("drivers.ethercat.drive.time.sleep", lambda _: None)
+    turning.drive.quick_stop()
+    turning.drive.stop_feeding()
+    turning.bench.heard()
+    turning.drive.remove_torque()
+    turning.until(lambda sample: sample.state is PowerState.OFF, 0.1)
+    assert abs(turning.bench.true_speed_rad_s) > 0.1
+    assert {identifier for identifier, _ in turning.bench.heard()} == {0, 1}
 
 
 def test_a_poll_never_enables_again(turning):
@@ -229,6 +253,48 @@ def test_a_refused_state_is_told_with_its_code(bench, monkeypatch):
     bench.drive.connect()
     with pytest.raises(PreflightRefused, match=r"to OP: it shows SAFE-OP, AL status code 0030h \(invalid DC SYNC"):
         bench.drive.preflight(LIMITS)
+
+
+@pytest.mark.parametrize("latency", [0, 1, 4, 20])
+def test_after_an_al_error_the_settings_are_restored_for_a_slave_that_needs_time(latency):
+    """AL control takes one request at a time: the slave ignores a second write before its firmware has read it."""
+    bench = EthercatBench()
+    before = bench.settings()
+    run = Run(bench)
+    run.turning(1.0, 0.4)
+    bench.slave.latency = latency
+    bench.slave.fall(4, 0x001B)
+    error_of(run)
+    run.stop()
+    assert run.drive.close() == ()
+    assert (bench.slave.state, bench.slave.ignored) == (2, [])
+    assert bench.settings() == before
+
+
+@pytest.mark.parametrize("latency", [0, 4])
+def test_an_error_that_follows_the_acknowledgement_is_a_refusal(bench, latency, monkeypatch):
+    slave = bench.slave
+    slave.latency = latency
+    slave.fall(4, 0x001B)
+    firmware = slave.firmware
+
+    def refuses():
+        if slave.wanted == 2 and not slave.waits:
+            slave.wanted = None
+            slave.fall(4, 0x0011)
+        firmware()
+
+    monkeypatch.setattr(slave, "firmware", refuses)
+    with pytest.raises(DriveFault, match=r"to PRE-OP: it shows SAFE-OP, AL status code 0011h"):
+        bench.segment.station.reach(2)
+
+
+def test_an_error_that_is_not_cleared_ends_the_wait(bench, monkeypatch):
+    monkeypatch.setattr("drivers.ethercat.station.STATE_S", 0.01)
+    bench.slave.fall(4, 0x001B)
+    bench.slave.firmware = lambda: None
+    with pytest.raises(DriveFault, match=r"to PRE-OP: it shows SAFE-OP, AL status code 001Bh"):
+        bench.segment.station.reach(2)
 
 
 def with_fixed_pdos(bench, rx, tx):
@@ -330,6 +396,50 @@ def test_a_stop_that_is_reversed_takes_the_drive_out_of_op(turning):
     target.enforce(6)
     assert turning.bench.slave.state == 4
     assert "was put into SAFE-OP" in target.remarks()[0]
+
+
+def test_a_stop_that_is_reversed_acknowledges_an_error_first(turning):
+    slave = turning.bench.slave
+    slave.latency = 4
+    slave.fall(8, 0x0012)
+    target = EthercatTarget(turning.bench.segment.station, load_profile("generic/cia402-ethercat"), SteppedClock(),
+                            lambda: None)
+    target.enforce(6)
+    assert (slave.state, target.remarks()) == (0x18, ())
+    for attempt in range(7, 13):
+        target.enforce(attempt)
+    assert slave.state == 4
+    assert "was put into SAFE-OP" in target.remarks()[0]
+
+
+@pytest.mark.parametrize("name", ["maxon/epos4-ethercat", "elmo/gold-ethercat"])
+def test_a_drive_that_keeps_torque_mode_is_taken_out_of_op_too(turning, name):
+    """Another master enables the drive after each quick stop. Mode of operation 6060h is refused while enabled."""
+    slave, clock, attempts = turning.bench.slave, SteppedClock(), []
+    slave.drive.acts[0x6060, 0](10)
+    write = slave.drive.write
+
+    def refuses(key, data):
+        if key == (0x6060, 0):
+            raise KeyError(key)
+        write(key, data)
+        if key == (0x6040, 0) and slave.state == 8:
+            write(key, b"\x0f\0")
+
+    slave.drive.write = refuses
+
+    class Target(EthercatTarget):
+        def enforce(self, attempt):
+            attempts.append(attempt)
+            super().enforce(attempt)
+
+    target = Target(turning.bench.segment.station, load_profile(name), clock, lambda: None)
+    report = bare_stop(target, clock, 2.0)
+    assert attempts[:6] == [1, 2, 3, 4, 5, 6]
+    assert slave.state == 4
+    assert report.last.state is PowerState.QUICK_STOP
+    assert any("was put into SAFE-OP" in line for line in report.remarks)
+    assert any("6060h" in line for line in report.remarks) is (name == "maxon/epos4-ethercat")
 
 
 def test_a_scan_reads_what_a_slave_says_of_itself(bench):

@@ -8,9 +8,11 @@ import pytest
 from drivers import quick_stop
 from drivers.canopen.bus import CanLink
 from drivers.canopen.quick_stop import BURST, BURST_PAUSE_S, BY_RPDO_TRIES, BY_SDO_TRIES, CanopenTarget
-from drivers.canopen.sdo import SdoObjects
+from drivers.canopen.sdo import ANSWER_S as AT_REST_S
+from drivers.canopen.sdo import TRIES, SdoObjects
+from drivers.cia402 import ANSWER_S
 from drivers.clock import MonotonicClock
-from drivers.errors import DriveFault, ObjectRefused
+from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
 from drivers.quick_stop import Ended
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.simulator import EmbeddedSimulator
@@ -91,6 +93,72 @@ def test_whatever_the_drive_refuses_before_it_the_quick_stop_is_written(wire, sc
         with suppress(ObjectRefused, DriveFault):
             target.ask(attempt)
     assert order(scripted).count((0x6040, 0x02)) == BY_SDO_TRIES + 2
+
+
+@pytest.mark.parametrize("refused", [(0x6060, 0), (0x6061, 0), (0x6041, 0)])
+def test_whatever_the_drive_refuses_the_rpdo_of_another_master_is_switched_off(wire, scripted, epos4, refused):
+    """The other master holds the drive in torque mode, and enables it after each quick stop."""
+    scripted.refuse_write[refused] = scripted.refuse_read[refused] = 0x08000022     # not in this state of the device
+    scripted.objects |= {(0x606C, 0): u(400, 4), (0x1400, 1): u(0x201, 4)}
+    attempts = []
+
+    def enables_again(request):
+        if not scripted.value(0x1400, 1) >> 31:
+            scripted.machine.state = "operation enabled"
+
+    scripted.before_answer = enables_again
+
+    class Target(CanopenTarget):
+        def enforce(self, attempt):
+            attempts.append(attempt)
+            super().enforce(attempt)
+
+    report = quick_stop.bare_stop(Target(wire, epos4, MonotonicClock(), node=1), MonotonicClock(), 5.0)
+    most = BY_SDO_TRIES + BY_RPDO_TRIES
+    assert attempts[: most + 1] == list(range(1, most + 2))
+    assert len(wire.of(0x201)) >= BURST
+    assert scripted.value(0x1400, 1) == 0x80000201
+    assert scripted.machine.state == "quick stop active"
+    assert any(f"{refused[0]:04X}h" in line for line in report.remarks)        # the first error of each attempt
+
+
+@pytest.mark.parametrize("name", ["kollmorgen/akd", "lenze/i950"])
+def test_a_drive_that_keeps_its_mode_while_enabled_gets_the_quick_stop_alone(wire, scripted, name):
+    target = CanopenTarget(wire, load_canopen_profile(name), MonotonicClock(), node=1)
+    target.ask(1)
+    target.ask(2)
+    assert order(scripted) == [(0x6040, 0x02)] * 2
+    (said,) = target.remarks()
+    assert "stays in torque mode" in said
+
+
+def test_a_drive_that_does_not_answer_gets_the_quick_stop_soon(wire, scripted, epos4):
+    """Frames arrive, and answers are lost. Only the first step waits as long as at standstill."""
+    sent = []
+    wire.on_send = lambda identifier, data: sent.append((wire.time.now_s, data[:4]))
+    begun_s = wire.time.now_s
+    with pytest.raises(CommunicationLost, match="node 1 does not answer"):
+        CanopenTarget(wire, epos4, MonotonicClock(), node=1).ask(BY_SDO_TRIES + BY_RPDO_TRIES + 1)
+    words = [time_s for time_s, head in sent if head == bytes.fromhex("2b406000")]
+    assert len(words) == TRIES
+    assert words[0] - begun_s <= TRIES * AT_REST_S + 3 * ANSWER_S
+
+
+def test_a_quick_stop_option_whose_write_is_lost_is_written_again(wire, scripted):
+    scripted.objects[0x605A, 0] = u(0, 2)
+    target, writes = target_of(wire), []
+
+    def loses(identifier, data):
+        writes.append(data[:4] == bytes.fromhex("2b5a6000"))
+        if not writes[-1] or sum(writes) > TRIES:
+            scripted.on_frame(identifier, data)
+
+    wire.on_send = loses
+    with pytest.raises(CommunicationLost):
+        target.ask(1)
+    assert scripted.value(0x605A) == 0
+    target.ask(2)
+    assert scripted.value(0x605A) == 6
 
 
 @pytest.mark.parametrize("name", ["generic/cia402", "maxon/epos4"])
