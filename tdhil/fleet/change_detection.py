@@ -15,8 +15,9 @@ not multiply (lags) or that may be zero (skew) are treated in the same way witho
 **A difference** of two results on one drive has s in both: it cancels, and the variance is σ_a² + σ_b². On two drives
 it is σ_a² + σ_b² + σ_s,a² + σ_s,b².
 
-**A history.** x = ln x_k is normal about μ·1 + δ·h. Here h is 0 before a step and 1 from the step on, or rises evenly
-with time from 0 to 1 (drift); μ has a flat prior. The covariance is Σ = κ² diag(σ_k²) + Σ_d σ_s² 1_d 1_dᵀ. The factor κ
+**A history.** x = ln x_k is normal about μ·1 + δ·h. Here h is 0 before a step and 1 from the step on, or 1 between two
+places (a change that ends again), or rises evenly with time from 0 to 1 (drift); μ has a flat prior. The covariance is
+Σ = κ² diag(σ_k²) + Σ_d σ_s² 1_d 1_dᵀ. The factor κ
 allows for intervals that are too narrow or too wide for the scatter between runs. Results are averaged over κ and over
 the size of the change, δ ~ N(0, τ²). With P = Σ⁻¹ − Σ⁻¹1(1ᵀΣ⁻¹1)⁻¹1ᵀΣ⁻¹, which eliminates μ, a = hᵀPh and b = hᵀPx,
 
@@ -24,15 +25,16 @@ the size of the change, δ ~ N(0, τ²). With P = Σ⁻¹ − Σ⁻¹1(1ᵀΣ⁻
     p(x | κ, h, τ) / p(x | κ, none) = (1 + τ²a)^−½ exp(½ τ²b² / (1 + τ²a)),
 
 because the change adds τ²hhᵀ to the covariance (Sherman and Morrison, and the matrix determinant lemma). Bayes' rule
-over none (½), a step (¼, evenly over its places) and drift (¼) gives the probabilities. If the prior is right, "no
-change" has less than 10 % in at most 1 of 9 histories without a change (Markov's inequality). The share measured by
-``benchmarks/trend_power.py`` is 0 to 1.5 %.
+over none, a step, two steps and drift (`_PRIOR`, evenly over the places) gives the probabilities. If the prior is
+right, "no change" has less than 10 % in at most 1 of 9 histories without a change (Markov's inequality). The share
+measured by ``benchmarks/trend_power.py`` is 0 to 1.5 %.
 
 Σ is diagonal but for one column per drive, Σ = D + UUᵀ, so Σ⁻¹ = W − WU(I + UᵀWU)⁻¹UᵀW with W = D⁻¹ (Woodbury). For
-the steps, hᵀΣ⁻¹h and hᵀΣ⁻¹x are sums over the results after the step. So the time grows with the number of results,
-not with its cube: 1000 results take about 0.03 s.
+the steps, hᵀΣ⁻¹h and hᵀΣ⁻¹x are sums over the results after the step, and for two steps differences of such sums. So
+the time grows with the number of results, not with its cube. Pairs of steps are searched at up to `_PAIRED` places.
 
-One step or drift is searched at a time. After a step, both sides are searched again. Then each step is placed again
+One step, two opposite steps, or drift is searched at a time. After a step, both sides are searched again. Without the
+pair, a change that ends again would count as scatter: one step does not explain it. Then each step is placed again
 between its neighbours, because the first was placed while the others were in the data.
 
 **The size of a step** is its posterior between the neighbouring steps, over κ, τ and place j, with 0 for no change:
@@ -49,13 +51,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from statistics import NormalDist, median
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tdhil.recording import FloatArray
+
+IntArray = NDArray[np.intp]
+
 
 ALARM: Final = 0.1
 """Limit for a change: it is reported if the probability of "no change" is below this."""
@@ -69,7 +76,8 @@ _PASSES: Final = 8          # most searches for the places of several steps; two
 _LEAST_SHARE: Final = 1e-6  # least weight of a component of a mixture, in units of the greatest
 _EXACT: Final = 1e-6        # resolution of a quantile of a mixture, in units of the least standard deviation
 _TINY: Final = 1e-300       # probabilities that are all zero by underflow stay zero
-_PRIOR: Final = {"none": 0.5, "step": 0.25, "drift": 0.25}
+_PRIOR: Final = {"none": 0.5, "step": 0.2, "pair": 0.1, "drift": 0.2}
+_PAIRED: Final = 128        # most places for a pair of steps; `_placed` then finds the exact ones
 
 
 @dataclass(frozen=True)
@@ -139,8 +147,10 @@ class ChangePoint:
 
 @dataclass(frozen=True)
 class History:
-    """Statement on a history. ``none``, ``step`` and ``drift`` add up to one. ``changes`` and ``drift_change`` are
-    empty unless "no change" is excluded. ``drift_change``: from the first result to the last.
+    """Statement on a history. ``none``, ``step`` (one or two) and ``drift`` add up to one.
+
+    ``changes`` and ``drift_change`` are empty unless "no change" is excluded. ``drift_change``: from the first result
+    to the last.
     """
 
     none: float
@@ -286,38 +296,67 @@ class _SizePosterior:
 @dataclass(frozen=True)
 class _ChangeEvidence:
     none: float
-    step: float
+    step: float                 # one step, or two
     drift: float
-    places: FloatArray          # probability of each place of a step: before result 1, 2, …
+    places: FloatArray          # probability of each place of a single step: before result 1, 2, …
+    pair: tuple[int, int] | None        # most probable places of two steps, if they are more probable than one
     step_size: _SizePosterior
     drift_size: _SizePosterior
 
 
-def _after(values: FloatArray) -> FloatArray:
-    """Return the sums of the rows after each row but the last: those of a step before result 1, 2, …"""
-    return np.cumsum(values[::-1], axis=0)[-2::-1]
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over the results from each place on, and 0 at the end, of the parts of hᵀΣ⁻¹h, hᵀΣ⁻¹1 and hᵀΣ⁻¹x.
+
+    ``weight``, ``ones``, ``of_x``: (n + 1,), ``scaled``: (n + 1, drives).
+    """
+
+    weight: FloatArray
+    scaled: FloatArray
+    ones: FloatArray
+    of_x: FloatArray
+
+    @classmethod
+    def of(cls, inverse: _Inverse, ones: FloatArray, of_x: FloatArray) -> _Sums:
+        return cls(*(np.append(np.cumsum(one[::-1], axis=0)[::-1], np.zeros_like(one[:1]), axis=0)
+                     for one in (inverse.weight, inverse.scaled, ones, of_x)))
+
+    def between(self, first: IntArray, last: IntArray, inner: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return hᵀΣ⁻¹h, hᵀΣ⁻¹1 and hᵀΣ⁻¹x of changes from result ``first`` to before result ``last``: (m,) each."""
+        weight, scaled, ones, of_x = (
+            one[first] - one[last] for one in (self.weight, self.scaled, self.ones, self.of_x))
+        return weight - np.sum((scaled @ inner) * scaled, axis=1), ones, of_x
 
 
-def _evidence(known: _Series) -> _ChangeEvidence:
+def _pairs(n: int) -> tuple[IntArray, IntArray]:
+    """Return first and last place of all pairs of steps among at most `_PAIRED` places, none at an end."""
+    stride = -(-n // _PAIRED)
+    at = np.arange(stride, n, stride)
+    first, last = np.triu_indices(len(at), 1)
+    return at[first], at[last]
+
+
+def _evidence(known: _Series, *, pairs: bool = True) -> _ChangeEvidence:
     n, time = len(known.x), known.time
     x = known.x - known.x.mean()                               # P takes out any constant; a small x is more exact
     span = time[-1] - time[0]
     rise = (time - time[0]) / span if span > 0.0 else np.arange(n) / (n - 1.0)
     sizes = median(known.sd) * np.array(_SIZES)                # np.median loads numpy.ma: 40 ms
     squares = sizes[:, None] ** 2                              # τ²
+    first, last = _pairs(n) if pairs else (np.zeros(0, dtype=int), np.zeros(0, dtype=int))
+    begins, ends = np.append(np.arange(1, n), first), np.append(np.full(n - 1, n), last)
     logs, each_log, means, variances = [], [], [], []
     for spread, prior in _SPREAD:
         inverse = _Inverse.of(known, spread)
-        weight, scaled = inverse.weight, inverse.scaled
         ones, of_x, of_rise = inverse.times(np.column_stack((np.ones(n), x, rise))).T
         total = float(ones.sum())
         misfit = float(x @ of_x - of_x.sum() ** 2 / total)
         logs.append(math.log(prior) + 0.5 * (inverse.log_det - math.log(total) - misfit))
-        tails = _after(scaled)
-        own = np.append(_after(weight) - np.sum((tails @ inverse.inner) * tails, axis=1), rise @ of_rise)       # hᵀΣ⁻¹h
-        level = np.append(_after(ones), rise @ ones)                                                    # hᵀΣ⁻¹1
+        of_steps = _Sums.of(inverse, ones, of_x).between(begins, ends, inverse.inner)
+        own, level, of_own = (np.append(*both) for both in zip(
+            of_steps, (rise @ of_rise, rise @ ones, rise @ of_x), strict=True))       # hᵀΣ⁻¹h, hᵀΣ⁻¹1, hᵀΣ⁻¹x
         a = own - level**2 / total
-        b = np.append(_after(of_x), rise @ of_x) - level * of_x.sum() / total
+        b = of_own - level * of_x.sum() / total
         gain = 1.0 + squares * a
         each_log.append(logs[-1] - math.log(len(sizes)) + 0.5 * (squares * b**2 / gain - np.log(gain)))
         means.append(squares * b / gain)
@@ -327,16 +366,19 @@ def _evidence(known: _Series) -> _ChangeEvidence:
     highest = max(*logs, float(by_size.max()))
     each = np.exp(by_size - highest).sum(axis=(0, 1))
     p_none = _PRIOR["none"] * sum(math.exp(one - highest) for one in logs)
-    p_steps = _PRIOR["step"] * each[:-1] / (n - 1.0)
+    p_steps = _PRIOR["step"] * each[: n - 1] / (n - 1.0)
+    p_pairs = _PRIOR["pair"] * each[n - 1 : -1] / max(len(first), 1)
     p_drift = _PRIOR["drift"] * float(each[-1])
-    p_step = float(p_steps.sum())
-    whole = p_none + p_step + p_drift
+    p_step, p_pair = float(p_steps.sum()), float(p_pairs.sum())
+    whole = p_none + p_step + p_pair + p_drift
     step_size, drift_size = (
         _SizePosterior.of(p_none / max(p_none + p_change, _TINY), by_size[..., shapes], mean[..., shapes],
                           variance[..., shapes])
-        for shapes, p_change in ((slice(-1), p_step), (-1, p_drift)))
+        for shapes, p_change in ((slice(n - 1), p_step), (-1, p_drift)))
+    best = int(np.argmax(p_pairs)) if p_pair > p_step else None
     return _ChangeEvidence(
-        p_none / whole, p_step / whole, p_drift / whole, p_steps / max(p_step, _TINY), step_size, drift_size,
+        p_none / whole, (p_step + p_pair) / whole, p_drift / whole, p_steps / max(p_step, _TINY),
+        None if best is None else (int(first[best]), int(last[best])), step_size, drift_size,
     )
 
 
@@ -355,10 +397,13 @@ def _steps(known: _Series, first: int) -> list[_FoundStep]:
     found = _evidence(known)
     if found.none >= ALARM or found.step <= found.drift:
         return []
-    one = _most_probable(found, first, found.step)
-    before = _steps(known.part(slice(one.at - first)), first)
-    after = _steps(known.part(slice(one.at - first, None)), one.at)
-    return [*before, one, *after]
+    new = [_most_probable(found, 0, found.step)]
+    if found.pair is not None:                 # a pair is searched at some places only
+        new = _placed(known, [replace(new[0], at=at) for at in found.pair])
+    ends = [0, *(one.at for one in new), len(known.x)]
+    parts = [_steps(known.part(slice(begin, end)), first + begin) for begin, end in pairwise(ends)]
+    placed = [replace(one, at=first + one.at) for one in new]
+    return [*parts[0], *(step for one, part in zip(placed, parts[1:], strict=True) for step in (one, *part))]
 
 
 def _most_probable(found: _ChangeEvidence, first: int, probability: float) -> _FoundStep:
@@ -375,7 +420,8 @@ def _placed(known: _Series, found: Sequence[_FoundStep]) -> list[_FoundStep]:
         for k, one in enumerate(steps):
             start = steps[k - 1].at if k else 0
             end = steps[k + 1].at if k + 1 < len(steps) else len(known.x)
-            steps[k] = _most_probable(_evidence(known.part(slice(start, end))), start, one.probability)
+            steps[k] = _most_probable(
+                _evidence(known.part(slice(start, end)), pairs=False), start, one.probability)
         if [one.at for one in steps] == before:
             break
     return steps
