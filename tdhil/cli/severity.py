@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Read, assess, print."""
-    from tdhil.cli.tune_inputs import read_result
+    from tdhil.cli.tune_inputs import inertia_warnings, read_result
     from tdhil.cli.tune_soft_torque import string_for
     from tdhil.report import (
         PlainConsole,
@@ -73,7 +73,7 @@ def run(namespace: argparse.Namespace) -> int:
     expected = None if namespace.controller is None else _expected(namespace)
     found: list[tuple[Severity, str]] = []
     noises: list[BitNoiseEstimate | str] = []
-    warnings: list[str] = []
+    warnings = inertia_warnings(result)
     faults = [str(one) for one in result.get("rehearsed_faults") or ()]      # those of the run that gave J
     simulated = bool(faults)
     configurations = []
@@ -106,15 +106,12 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _inertia(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[float, Interval]:
     """Return the gear ratio, and J at the main shaft with its interval. Raises TuningRefused without J."""
+    from tdhil.cli.tune_inputs import inertia_to_tune_for
     from tdhil.soft_torque import Interval, TuningRefused
 
-    inertia, ratio = result["inertia_kg_m2"], result["gear_ratio"]
-    if result["verdict"] not in ("valid", "valid_wide") or not isinstance(inertia, dict):
-        raise TuningRefused(f"the result has no J ({result['verdict']}), and the string's torque is T − J α",
-                            where=str(namespace.result), next_step="Identify again with a motion that identifies J",
-                            entry=MessageCode.NO_INERTIA_TO_TUNE)
-    square = float(ratio) ** 2
-    return float(ratio), Interval(*(square * float(inertia[key]) for key in ("value", "low_total", "high_total")))
+    low, value, high = inertia_to_tune_for(result, namespace.result, TuningRefused)
+    ratio = float(result["gear_ratio"])
+    return ratio, Interval(*(ratio**2 * one for one in (value, low, high)))
 
 
 def _surface(

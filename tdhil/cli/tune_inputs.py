@@ -54,8 +54,8 @@ def read_result(path: Path) -> Mapping[str, Any]:
         raise UsageError("is JSON, but not a result of tdhil identify", where=str(path),
                          next_step="Write one with: tdhil identify --json > result.json",
                          entry=MessageCode.WRONG_KIND_OF_FILE)
-    inertia = document["inertia_kg_m2"]
-    stated = inertia.get("confidence", COVERAGE) if isinstance(inertia, dict) else COVERAGE
+    parts = [one for one in (document["inertia_kg_m2"], document.get("frequency_response")) if isinstance(one, dict)]
+    stated = next((one["confidence"] for one in parts if is_number(one.get("confidence"))), COVERAGE)
     if abs(float(stated) - COVERAGE) > 1e-9:
         raise UsageError(f"its intervals have a coverage of {100.0 * stated:g} %, and 95 % is needed", where=str(path),
                          next_step="Name the log instead, or write it again: tdhil replay run.mcap --confidence 0.95"
@@ -155,6 +155,15 @@ def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
             raise UsageError(f"{key} is not a number", where=f"--impedance {path}",
                              entry=MessageCode.WRONG_KIND_OF_FILE)
     return found
+
+
+def reported_filter(result: Mapping[str, Any]) -> tuple[float, bool] | None:
+    """Return the filter of the drive's speed loop as the drive reports it, s, and whether its entry is verified."""
+    found = result.get("speed_loop_present")
+    if not isinstance(found, dict) or not is_number(found.get("filter_s")):
+        return None
+    setting = (found.get("settings") or {}).get("filter") or {}
+    return float(found["filter_s"]), setting.get("confidence") == "verified"
 
 
 def read_bit_noise(path: Path) -> tuple[Interval, float]:

@@ -32,6 +32,7 @@ from tdhil.cli.tune_inputs import (
     read_bit_noise,
     read_impedance,
     read_result,
+    reported_filter,
     require_result,
     speed_controller_of,
 )
@@ -526,6 +527,8 @@ def _lags(
     inner = list(namespace.inner_lags or ASSUMED_LAGS_S)
     axes: list[list[float]] = []
     said = "as stated" if namespace.inner_lags else "assumed, not measured"
+    if (reported := reported_filter(result)) is not None and not namespace.inner_lags:
+        inner[0], said = reported[0], "the speed filter as the drive reports it; the rest assumed, not measured"
     if measured is not None and not namespace.inner_lags:
         inner, axes = measured_lags(measured)
         said = "as measured (--impedance)"
@@ -543,7 +546,8 @@ def _lags(
     waiting = 1.5 * float(period) if is_number(period) else 0.0
     low, late, high = ends_of(reported)
     # the drive's own speed filter, the first of the inner lags, is not part of a loop over the bus
-    rest = [sqrt(sum(axis[k] ** 2 for axis in axes)) for k in range(1, len(inner))] if axes else []
+    tolerance = STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE
+    rest = [sqrt(sum(axis[k] ** 2 for axis in axes)) if axes else tolerance * inner[k] for k in range(1, len(inner))]
     others = [[0.0, 0.0, *(half if k == at else 0.0 for k in range(len(rest)))] for at, half in enumerate(rest)]
     return _moved_lags(
         [late, waiting, *inner[1:]], [[0.5 * (high - low), 0.0, *(0.0 for _ in inner[1:])], *others],
@@ -575,10 +579,6 @@ def _tuned_for(
 
     settings: dict[str, tuple[DriveSetting, ...]] = {}
     warnings, factor = inertia_warnings(result), calibration_factor(result)
-    if factor != 1.0:
-        warnings.append(f"The result has a torque calibration (factor {factor:.4g}), which the drive does not know. P "
-                        "and I in the table are in true N·m. The values of the drive's parameters are divided by this "
-                        "factor: type in these.")
     ratio = float(result["gear_ratio"])
     if profile is not None and namespace.loop == "drive":
         parameters = speed_controller_of(profile, result)
@@ -591,6 +591,11 @@ def _tuned_for(
         if any(one.compensated_share for one in tuning.tuned):
             warnings.append("Inertia compensation needs feedback of the measured acceleration in the drive. Few drives "
                             "have it. Feed-forward of the setpoint's acceleration does not replace it.")
+    if factor != 1.0:
+        warnings.append(f"The result has a torque calibration (factor {factor:.4g}), which the drive does not know. P "
+                        "and I in the table are in true N·m. " + (
+                            "The values of the drive's parameters are divided by this factor: type in these."
+                            if settings else "Divide P, I and J_c by this factor before you type them in."))
     if namespace.bit_noise is not None and (bit := tuning.case.string.bit) is not None:
         warnings.append(f"The bit noise of {bit.noise_nm:.0f} N·m rms is that of the record in "
                         f"{namespace.bit_noise.name}. It is valid for the bit, formation and weight on bit there.")

@@ -29,6 +29,7 @@ from tdhil.cli.tune_inputs import (
     profile_for,
     read_impedance,
     read_result,
+    reported_filter,
     require_result,
     speed_controller_of,
 )
@@ -108,7 +109,8 @@ def run(namespace: argparse.Namespace) -> int:
     with working("reading the result …"):        # a log is identified again, which takes seconds
         result = in_drive_torque(read_result(namespace.result))
         measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
-    lags, dead_time, lags_from = lags_in(namespace.inner_lags, namespace.dead_time, measured)
+    lags, dead_time, lags_from = lags_in(
+        namespace.inner_lags, namespace.dead_time, measured, reported_filter(result))
     plant = plant_of(result, lags, dead_time, namespace.result)
     present, present_from = present_gains(namespace, measured, result)
     case = SpeedLoopCase(plant, namespace.phase_margin, namespace.gain_margin, namespace.bandwidth, present,
@@ -152,9 +154,13 @@ def _check(namespace: argparse.Namespace) -> None:
 
 
 def lags_in(
-    stated: Sequence[float] | None, dead_time_s: float | None, measured: Mapping[str, Any] | None
+    stated: Sequence[float] | None, dead_time_s: float | None, measured: Mapping[str, Any] | None,
+    reported: tuple[float, bool] | None = None,
 ) -> Lags:
-    """Return the lags of the drive's speed loop, its dead time, and their source. Raises UsageError if all are 0."""
+    """Return the lags of the drive's speed loop, its dead time, and their source. Raises UsageError if all are 0.
+
+    ``reported``: filter of the loop as the drive reports it (`reported_filter`); it replaces an assumed one.
+    """
     from tdhil.speed_loop import Range
 
     def open_by(value: float, tolerance: float) -> Range:
@@ -179,6 +185,10 @@ def lags_in(
                 else open_by(dead_time_s, STATED_TOLERANCE))
         said = "assumed, not measured" if not stated else (
             "as stated" if dead_time_s is not None else "as stated; the dead time is assumed")
+        if reported is not None and not stated:
+            filter_s, verified = reported
+            lags = (open_by(filter_s, STATED_TOLERANCE if verified else ASSUMED_TOLERANCE), *lags[1:])
+            said = "the speed filter as the drive reports it; the rest assumed, not measured"
     if not any(lag.value for lag in lags) and not dead.value:
         raise UsageError("there is no lag in the drive's loop, so nothing limits its gains", where="--inner-lags",
                          next_step="State the filter of its speed, its torque loop and its sampling",

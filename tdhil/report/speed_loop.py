@@ -188,12 +188,18 @@ def _sentence(design: LoopDesign) -> str:
     tuned, case = design.tuned, design.case
     notch = tuned.gains.notch
     with_notch = "" if notch is None else f", with a notch at {notch.hertz:.3g} Hz"
-    said = (f"Type in P = {gain_words(tuned.gains.gain_nm_s_rad)} N·m·s/rad and "
-            f"I = {gain_words(tuned.gains.integral_nm_rad)} N·m/rad{with_notch}.")
-    kind = "requested" if case.bandwidth_hz is not None else "largest"
-    said += (f" The {kind} bandwidth is {tuned.bandwidth_hz.value:.3g} Hz, with at least {tuned.worst.phase_deg:.0f}° "
-             f"and {_number(tuned.worst.gain_db, 1)} dB in the worst case.")
+    gains = (f"P = {gain_words(tuned.gains.gain_nm_s_rad)} N·m·s/rad and "
+             f"I = {gain_words(tuned.gains.integral_nm_rad)} N·m/rad{with_notch}")
     present = next((row for row in design.rows if row.kind == "present"), None)
+    if (present is not None and case.bandwidth_hz is None and present.bandwidth_hz.value >= tuned.bandwidth_hz.value
+            and present.worst.keeps(case.phase_deg, case.gain_db)):
+        return (f"The present gains keep the margins and are faster: {present.bandwidth_hz.value:.3g} Hz, "
+                f"{present.worst.phase_deg:.0f}° and {_number(present.worst.gain_db, 1)} dB. With I = P²/(4 J), which "
+                f"removes a lasting error sooner, the largest bandwidth is {tuned.bandwidth_hz.value:.3g} Hz: {gains}.")
+    said = f"Type in {gains}."
+    kind = "requested bandwidth" if case.bandwidth_hz is not None else "largest bandwidth with I = P²/(4 J)"
+    said += (f" The {kind} is {tuned.bandwidth_hz.value:.3g} Hz, with at least {tuned.worst.phase_deg:.0f}° "
+             f"and {_number(tuned.worst.gain_db, 1)} dB in the worst case.")
     if present is not None and present.worst.stable:
         said += f" The present gains give {present.bandwidth_hz.value:.3g} Hz and {present.worst.phase_deg:.0f}°."
     return said

@@ -245,6 +245,10 @@ def _advice(tuning: Tuning) -> dict[str, Any]:
 def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
     assert base is not None
     what = "the present gains" if base.kind == "present" else "a stiff speed loop"
+    offered = any(one.controller is not None and not one.failed for one in tuning.tuned if one is not base)
+    if best is None and not offered and base.worst is not None and not base.worst.stable:
+        return (f"Do not keep {what}: they are unstable on a sampled machine. No other controller keeps the margins"
+                " either. Lower the lags inside the loop, or the required --margins.")
     if best is None and not tuning.advice.keep:
         why, needed = ("no bit is stated", "State bottom.coulomb_nm in string.yaml (--string) to compare them.")
         if tuning.case.string.bit is not None:
@@ -255,13 +259,18 @@ def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
             return head
         return f"{head} Soft gains, compared with {what}: {_changes(base, soft)}."
     if best is None:
-        offered = any(one.controller is not None and not one.failed for one in tuning.tuned if one is not base)
         head = ("Keep what you have: " if base.kind == "present" else "Keep a stiff speed loop: ")
         if not offered:
-            return head + "no other controller keeps the margins."
+            return head + "no other controller keeps the margins." + _thin(what, base)
         speed = "" if base.cure is None else f" of {_rpm_words(base.cure)}"
-        return head + f"no other controller lowers the critical speed{speed} by more than the search resolves."
+        return (head + f"no other controller lowers the critical speed{speed} by more than the search resolves."
+                + _thin(what, base))
     return f"Type in the {best.kind} gains. Compared with {what}: {_changes(base, best)}."
+
+
+def _thin(what: str, base: Tuned) -> str:
+    """Return a sentence on the margins that the kept gains fail; '' without one."""
+    return f" But {what} do not keep the margins: {', '.join(base.failed)}." if base.failed else ""
 
 
 def _changes(base: Tuned, best: Tuned) -> str:
@@ -545,7 +554,9 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
         thin = document["advice"]["thin"]
         lines = (f"Thin: {', '.join(thin)}.",) if thin else ()
         headline, verdict = "Nothing to change", "keep what you have"
-        if not document["advice"]["keep"]:
+        if thin:
+            headline, verdict = "No better gains were found", "the gains in place do not keep the margins"
+        elif not document["advice"]["keep"]:
             headline, verdict = "No gains are recommended", "critical speeds not compared"
         return AnswerBox("red" if thin else "yellow", headline, lines, verdict, sentence, "")
     gains = best["at_motor"]

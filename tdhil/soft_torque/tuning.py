@@ -146,7 +146,8 @@ def _under_noise(
 def advice_of(found: Sequence[Tuned]) -> Advice:
     """Return the advice: the best row that keeps every margin, if it is better than the first row.
 
-    Without critical speeds nothing is compared: no row, and no advice to keep the present gains.
+    Without critical speeds nothing is compared: no row, and no advice to keep the present gains. Gains that are
+    unstable on a sampled truth are never kept.
     """
     base = found[0]
     offered = [one for one in found[1:] if one.controller is not None and not one.failed and one.kind != "stiff"]
@@ -154,8 +155,9 @@ def advice_of(found: Sequence[Tuned]) -> Advice:
         offered = [one for one in offered if one is not base]
     elif found[1].controller is not None and not found[1].failed:
         offered.append(found[1])
+    unstable = base.worst is not None and not base.worst.stable
     if not offered:
-        return Advice(None, base.kind, keep=True)
+        return Advice(None, base.kind, keep=not unstable)
     if base.cure is None or base.controller is None:
         return Advice(None, base.kind, keep=False)
 
@@ -175,7 +177,7 @@ def advice_of(found: Sequence[Tuned]) -> Advice:
         return bool(gain >= log(1.0 + NOT_BETTER_SHARE)) and better_share(one) >= LEAST_BETTER_SHARE
 
     best = min(offered, key=mean)
-    if not helps(best):
+    if not unstable and not helps(best):
         return Advice(None, base.kind, keep=True, better_share=better_share(best))
     # the soft controller, which every drive can run, is preferred if it is as good
     soft = next((one for one in offered if one.kind == "soft" and helps(one)), None)

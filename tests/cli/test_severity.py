@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tdhil.cli.main import main
+from tdhil.errors import MessageCode
 from tdhil.soft_torque import reflection_at
 from tests.cli.test_tune import result
 from tests.soft_torque.cases import DRIVE, SOFT_035, STRING
@@ -87,6 +88,8 @@ def test_two_records_side_by_side_in_80_columns_and_as_a_page(bench, capsys):
 
 @pytest.mark.parametrize(("change", "code", "message"), [
     ({"verdict": "not_identifiable", "inertia_kg_m2": None}, 11, "the result has no J"),
+    # with J of motor and string, the bit noise was 40 % too large, and its interval excluded the truth
+    ({"warning_codes": [MessageCode.STRING_MOVES_WITH_MOTOR.code]}, 11, "motor and string together"),
     ({}, 2, "a controller"),
 ])
 def test_usage_errors(bench, capsys, change, code, message):

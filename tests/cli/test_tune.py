@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tdhil.cli import tune_soft_torque
 from tdhil.cli.main import main
 from tdhil.cli.tune_soft_torque import add_arguments, case_of, string_for
 from tdhil.errors import ExitCode, MessageCode
@@ -125,6 +126,26 @@ def test_what_is_refused(tuned, words, said, code, message):
     assert message in document["error"]["message"]
     assert message.split()[-1] in err
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("stated", "share"), [(None, 0.5), ([0.02, 0.01, 0.003], 0.1)])
+def test_over_the_bus_each_lag_keeps_its_tolerance(stated, share):
+    """As soon as the reported lag had an interval, the other lags counted as exact."""
+    asked = argparse.Namespace(inner_lags=stated, loop="bus")
+    found = {"speed_lag_s": interval(0.4, 0.39, 0.41), "cycle": {"period_s": 0.02}}
+    lags, ends, _ = tune_soft_torque._lags(found, asked, None)
+    moved = [[one.inner_lags_s for one in pair] for pair in ends]
+    for at, lag in ((2, 0.01), (3, 0.003)):
+        assert lags[at] == lag
+        assert max(abs(one[at] - lag) for pair in moved for one in pair) == pytest.approx(share * lag)
+
+
+def test_a_reported_filter_is_the_first_lag_of_the_loop():
+    found = {"speed_loop_present": {"filter_s": 0.15, "settings": {"filter": {"confidence": "verified"}}}}
+    lags, _, said = tune_soft_torque._lags(found, argparse.Namespace(inner_lags=None, loop="drive"), None)
+    assert lags == (0.15, 0.01, 0.003) and "as the drive reports it" in said
+    stated, *_ = tune_soft_torque._lags(found, argparse.Namespace(inner_lags=[0.02], loop="drive"), None)
+    assert stated == (0.02,)
 
 
 @pytest.mark.heavy

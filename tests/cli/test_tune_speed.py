@@ -78,6 +78,33 @@ def test_intervals_of_another_coverage_are_refused(tuned, coverage):
     assert tuned(inertia_kg_m2={**inertia, "confidence": 0.95})[0] == 0
 
 
+def test_an_impedance_of_another_coverage_is_refused(tuned):
+    """Such a result has no J whose coverage could be read."""
+    response_50 = {**response(), "confidence": 0.5}
+    code, document, _ = tuned(inertia_kg_m2=None, verdict="not_identifiable", frequency_response=response_50)
+    assert code == 2 and "a coverage of 50 %" in document["error"]["message"]
+
+
+@pytest.mark.parametrize(("confidence", "high"), [("verified", 0.165), ("likely", 0.225)])
+def test_the_filter_that_the_drive_reports_is_in_the_loop(tuned, confidence, high):
+    """20 ms were assumed beside it: the phase margin was 15° instead of the promised 45°."""
+    present = {"gain_nm_s_rad": None, "integral_nm_rad": None, "filter_s": 0.15,
+               "settings": {"filter": {"confidence": confidence}}}
+    assumed, reported = (tuned(speed_loop_present=one)[1] for one in (None, present))
+    assert reported["plant"]["lags_s"][0] == pytest.approx({"value": 0.15, "low": 0.3 - high, "high": high})
+    assert reported["controllers"][-1]["gain_nm_s_rad"] < 0.5 * assumed["controllers"][-1]["gain_nm_s_rad"]
+    stated = tuned("--inner-lags", "20ms", "10ms", speed_loop_present=present)[1]
+    assert stated["plant"]["lags_s"][0]["value"] == 0.02
+
+
+def test_present_gains_that_are_faster_within_the_margins_are_not_replaced(tuned):
+    code, text, _ = tuned("--present", 320, 240, "--inner-lags", "20ms", "10ms", "--dead-time", "3ms", as_json=False,
+                          inertia_kg_m2=estimate(15.0, 14.9, 15.1))
+    assert code == 0
+    assert "present gains keep the margins and are faster" in " ".join(text.split())
+    assert "Type in" not in text
+
+
 def test_the_terminal_fits_80_columns_and_shows_the_parameters(tuned):
     code, text, _ = tuned("--inner-lags", "20ms", "10ms", "--dead-time", "3ms", "--profile", "abb/acs880-enhanced",
                           "--bandwidth", "0.8", as_json=False)

@@ -33,6 +33,7 @@ from tdhil.soft_torque import (
     tune,
     tuned_controller,
 )
+from tdhil.soft_torque.stability import LoopMargins
 from tdhil.soft_torque.tuning import advice_of
 from tests.soft_torque.cases import BIT, DRIVE, SOFT_035, SOFT_1, STIFF, STRING, string_with
 from tests.soft_torque.chain_in_time import ends_turning, reference_case
@@ -71,6 +72,20 @@ def test_the_advice_is_the_best_row_that_is_clearly_better(rows, kind):
     advice = advice_of(rows)
     assert advice.kind == kind and advice.keep is (kind is None)
     assert advice.compared_with == rows[0].kind
+
+
+UNSTABLE = LoopMargins(stable=False, phase_deg=0.0, gain_db=0.0, dead_time_s=0.0, lag_s=0.0, modulus=0.0)
+
+
+@pytest.mark.parametrize(("others", "kind"), [
+    ((row("stiff", 150.0, ("dead-time reserve",)), row("soft", 40.0, ("phase",))), None),
+    ((row("stiff", 150.0), row("soft", 70.0)), "soft"),
+])
+def test_unstable_gains_are_never_kept(others, kind):
+    """The sentence was "Keep what you have", also for a row that is 30 % slower and keeps all margins."""
+    base = replace(row("present", 51.3, ("unstable",)), worst=UNSTABLE)
+    advice = advice_of((base, *others))
+    assert (advice.kind, advice.keep) == (kind, False)
 
 
 def test_a_row_that_is_better_in_some_draws_only_is_not_recommended():
