@@ -57,7 +57,7 @@ def evaluation_document(
             "inner_lags_s": list(case.meant.inner_lags_s),
         },
         "critical_rpm": None if found.critical_rpm is None else asdict(found.critical_rpm),
-        "predicted_critical_rpm": asdict(prediction.cure_rpm),
+        "predicted_critical_rpm": asdict(prediction.cure_rpm) | ({"high": None} if prediction.cure_open else {}),
         "least_damping": None if found.damping is None else {
             "value": found.damping, "hertz": found.damped_hz,
             "low": None if found.damping_interval is None else found.damping_interval.low,
@@ -114,7 +114,7 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "why", document["reason"]
     yield from rehearsal_rows(document.get("rehearsal"))
     critical, predicted = document["critical_rpm"], document["predicted_critical_rpm"]
-    expected_text = f"tune: {predicted['value']:.0f} ({predicted['low']:.0f} to {predicted['high']:.0f})"
+    expected_text = f"tune: {_predicted(predicted)}"
     yield "critical speed", (
         f"not found; {expected_text} rpm" if critical is None
         else f"{critical['value']:.1f} rpm, sticks at {critical['low']:.1f}; {expected_text} rpm")
@@ -210,12 +210,18 @@ def _answer(document: Part) -> AnswerBox:
     return AnswerBox(colour, value, (line,), words, f"{document['reason']}.", "")
 
 
+def _predicted(cure: Part) -> str:
+    """Return the predicted critical speed with its interval, rpm; '?' for an end above all speeds that were tried."""
+    end = "?" if cure["high"] is None else f"{cure['high']:.0f}"
+    return f"{cure['value']:.0f} ({cure['low']:.0f} to {end})"
+
+
 def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
     """Yield (quantity, measured, predicted)."""
     critical, cure = document["critical_rpm"], document["predicted_critical_rpm"]
     yield ("critical speed, rpm",
            "not found" if critical is None else f"{critical['value']:.1f}, sticks at {critical['low']:.1f}",
-           f"{cure['value']:.0f} ({cure['low']:.0f} to {cure['high']:.0f})")
+           _predicted(cure))
     damping, expected = document["least_damping"], document["predicted_least_damping"]
     yield ("least damping of the lowest modes",
            "not found in the decay" if damping is None else f"{_damping(damping)} at {damping['hertz']:.3f} Hz",

@@ -80,7 +80,8 @@ def evaluation_case(
         real = IdentifiedRig(inertia["value"], _value(rig["viscous_nm_s_rad"]), _value(rig["coulomb_nm"]),
                              max(0.0, lag["value"]), rig["gear_ratio"], torque_factor)
         prediction = Prediction(
-            use, _interval(cure), _interval(chosen["least_damping"]), tuple(tuning["string"]["modes_hz"]))
+            use, _interval(cure), _interval(chosen["least_damping"]), tuple(tuning["string"]["modes_hz"]),
+            cure["high"] is None)
         return EvaluationCase(string, meant, SpeedController(**chosen["at_main_shaft"]), real, prediction, error_s,
                               own_loop)
     except (KeyError, TypeError, AttributeError, IndexError) as error:

@@ -63,6 +63,14 @@ class Prediction:
     cure_rpm: Interval
     least_damping: Interval
     string_modes_hz: tuple[float, ...]
+    cure_open: bool = False
+    """True: the critical speed has no upper end, because it is above the highest speed that `tune` tried on some draws.
+    The end of ``cure_rpm`` is then its value."""
+
+    @property
+    def cure_words(self) -> str:
+        """Return the interval of the critical speed, rpm, in words."""
+        return f"{self.cure_rpm.low:.0f} {'or more' if self.cure_open else f'to {self.cure_rpm.high:.0f}'}"
 
 
 @dataclass(frozen=True)
@@ -304,7 +312,8 @@ def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradic
     reached = float(set_rad_s.max())
     disturbed, cure = None, case.prediction.cure_rpm
     # the bracket of the critical speed does not meet the predicted interval
-    if critical is not None and max(cure.low - critical.value, critical.low - cure.high) > TOLERANCE_RPM:
+    highest = inf if case.prediction.cure_open else cure.high
+    if critical is not None and max(cure.low - critical.value, critical.low - highest) > TOLERANCE_RPM:
         disturbed = disturbed_trials(case.string, case.meant, case.law, program, cure, column["unknown_nm"][coupled],
                                      period_s)
     outcome, why = _verdict(case, program, clamped, (unknown, foreign), did_stick, critical, decay, reached,
@@ -329,7 +338,7 @@ def _verdict(
     ``unknown``: torque that was not commanded, in N·m rms and as a share of the torque that moved the shaft.
     ``disturbed``: simulated trials under the unknown torque, for a critical speed that is not near the prediction.
     """
-    predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
+    damping = case.prediction.least_damping
     unknown_nm, foreign = unknown
     if clamped:
         return EvaluationOutcome.INVALID, f"the torque limit acted on the virtual string's torque in {clamped} cycles"
@@ -345,7 +354,7 @@ def _verdict(
             return (EvaluationOutcome.NOT_FOUND,
                     f"the run ended at {reached / RPM:.0f} rpm, before a bit that was stuck kept turning")
         return EvaluationOutcome.NOT_FOUND, "a stuck bit did not keep turning at any set speed, up to the highest one"
-    words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
+    words = f"critical speed {critical.value:.1f} rpm, predicted {case.prediction.cure_words}"
     if disturbed is not None:
         words += (f"; under the {unknown_nm:.0f} N·m rms of torque that was not commanded, the bit turns in "
                   f"{disturbed.turning_at(critical.value)} of {TRIALS} simulated trials at the first speed, and in "
@@ -548,7 +557,7 @@ def case_of(plain: Mapping[str, Any]) -> EvaluationCase:
         SpeedController(**plain["law"]),
         IdentifiedRig(**plain["rig"]),
         Prediction(prediction["kind"], Interval(**prediction["cure_rpm"]), Interval(**prediction["least_damping"]),
-                   tuple(prediction["string_modes_hz"])),
+                   tuple(prediction["string_modes_hz"]), bool(prediction.get("cure_open", False))),
         plain["speed_lag_error_s"],
         bool(plain.get("own_loop", False)),
     )

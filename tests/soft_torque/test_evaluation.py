@@ -222,6 +222,17 @@ def test_the_torque_of_the_highest_set_speed_counts_before_motion():
 
 
 @pytest.mark.heavy
+def test_a_prediction_without_an_upper_end_excludes_no_higher_speed():
+    """On some draws the critical speed is above the highest speed that tune tried: "57 (56 to ?)"."""
+    log = rows(74.0, (77.0, 70.0, 74.0), damping=0.22)
+    assert evaluate(log, CASE, PROGRAM).outcome is EvaluationOutcome.DIFFERS
+    open_case = replace(CASE, prediction=replace(PREDICTED, cure_open=True))
+    found = evaluate(log, open_case, PROGRAM)
+    assert found.outcome is EvaluationOutcome.AS_PREDICTED, found.why
+    assert "predicted 56 or more" in found.why
+    assert case_of(json.loads(json.dumps(open_case.plain()))) == open_case
+
+
 def test_trials_are_long_enough_for_slow_stick_slip():
     """A trial of a loop with a long integral time lasts as long as the simulation of the prediction requires."""
     assert program_for(CASE, WINDOW).calm_s == SpeedProgram.calm_s
