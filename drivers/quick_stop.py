@@ -47,6 +47,11 @@ LONGEST_STOP_S = 120.0
 """Longest time of the whole stop, s."""
 MOST_TROUBLES = 20
 """Number of errors that the report repeats."""
+SLOPE_S, LONGEST_LAG_S = 1.0, 2.0
+"""Time before the torque is off in which the fall of the speed is measured, and longest lag of a reported speed, s."""
+FALLEN_SHARE = 0.4
+"""Share of its speed by which a report that lags has fallen one lag later: 0.63 with a first-order lag, 1 with a dead
+time. A shaft that runs out without a brake falls by less, unless friction brakes it nearly as fast as the drive."""
 _NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.NOT_READY, PowerState.FAULT)
 
 
@@ -214,7 +219,7 @@ def step(before: StopCourse, now: StopRound) -> tuple[StopCourse, StopAction]:
 def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_STOP_S) -> BareStopReport:
     """Stop the shaft. Never raises: errors are among the remarks."""
     stopping, action = StopCourse.begin(clock.now_s(), longest_s), StopAction.REQUEST
-    readings: list[Seen] = []
+    rounds: list[StopRound] = []       # those with a reading
     troubles: list[str] = []
     asked = 0
     while action is not StopAction.END:
@@ -225,35 +230,60 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_STOP_S) -
             except TdhilError as error:    # the reading shows whether it helped anyway
                 troubles.append(str(error))
         try:
-            readings.append(target.poll())
-            now = StopRound(clock.now_s(), readings[-1])
+            seen = target.poll()
+            now = StopRound(clock.now_s(), seen)
+            rounds.append(now)
         except TdhilError as error:
             troubles.append(str(error))
             now = StopRound(clock.now_s(), None, heard=not isinstance(error, CommunicationLost))
         stopping, action = step(stopping, now)
         clock.wait_until(clock.now_s() + PAUSE_S)
     assert stopping.ended is not None
+    readings = [one.seen for one in rounds if one.seen is not None]
     return BareStopReport(
         stopping.ended,
         readings[0] if readings else None,
         readings[-1] if readings else None,
         clock.now_s() - stopping.begun_s,
         asked,
-        (*target.remarks(), *_remarks(readings), *dict.fromkeys(troubles[:MOST_TROUBLES])),
+        (*target.remarks(), *_remarks(rounds), *dict.fromkeys(troubles[:MOST_TROUBLES])),
     )
 
 
-def _remarks(readings: list[Seen]) -> list[str]:
+def _remarks(rounds: list[StopRound]) -> list[str]:
     """Return remarks on the readings besides the end: a shaft that ran out, a state that is not valid."""
     said = []
-    coasted = next((one for one in readings if one.state is PowerState.OFF and not one.near_zero), None)
+    readings = [(one.time_s, one.seen) for one in rounds if one.seen is not None]
+    coasted = _ran_out(readings)
     if coasted is not None:
         said.append(
-            f"the torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: the shaft ran out"
+            f"the drive reported its torque off at {coasted.speed:.3g} {coasted.unit}, and this speed did not fall as"
+            " fast as during braking: the shaft ran out without a brake"
         )
-    shown = next((one.text for one in reversed(readings) if one.blank), "")
+    shown = next((one.text for _, one in reversed(readings) if one.blank), "")
     if shown:
         said.append(
             f"the drive showed {shown}: tdhil ignored the speed beside it, and requested the quick stop again"
         )
     return said
+
+
+def _ran_out(readings: list[tuple[float, Seen]]) -> Seen | None:
+    """Return the first reading of a turning shaft without torque; None if there is none, or if the report only lags.
+
+    A speed report with the lag L is ahead of a ramp of the slope a by a·L. When the drive has stopped the shaft and
+    switches its torque off, the report still shows about this speed, and then falls within L.
+    """
+    at = next((k for k, (_, one) in enumerate(readings) if one.state is PowerState.OFF and not one.near_zero), None)
+    if at is None:
+        return None
+    off_s, off = readings[at]
+    begun_s, begun = next((time_s, one) for time_s, one in readings if time_s >= off_s - SLOPE_S)
+    fallen = abs(begun.speed) - abs(off.speed)
+    if fallen <= 0.0:                  # not braked before
+        return off
+    lag_s = abs(off.speed) * (off_s - begun_s) / fallen
+    later = next((one for time_s, one in readings[at:] if time_s >= off_s + lag_s), None)
+    if lag_s > LONGEST_LAG_S or later is None:
+        return off
+    return None if later.near_zero or abs(later.speed) <= (1.0 - FALLEN_SHARE) * abs(off.speed) else off

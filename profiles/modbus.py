@@ -93,6 +93,9 @@ class Control(ProfileEntry):
     )
     quick_stop: Word = Field(description="brakes to standstill, under the drive's own speed control")
     fault_reset: tuple[Word, ...] = Field(min_length=1, description="words sent one after the other to reset a fault")
+    fault_reset_register: Register | None = Field(
+        default=None, description="register of the words of `fault_reset`; null: that of the control word"
+    )
     speed_bits: Word = Field(default=0, description="bits set in every word in speed control")
     torque_bits: Word = Field(default=0, description="bits set in every word in torque control")
     reverse_bits: Word | None = Field(

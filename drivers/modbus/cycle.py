@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from drivers.drive import Command, Mode
-from drivers.errors import CommandRejected, PreflightRefused
+from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import RegisterAccess, RegisterAnswer
 from drivers.modbus.codec import Scales, WordOrder, from_words, register_name, to_counts, to_words
-from drivers.modbus.pdu import BUSY, NoisyReply, RegisterRefused
+from drivers.modbus.pdu import BUSY, LinkLost, NoisyReply, RegisterRefused
 from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Position, Register
 
@@ -237,18 +237,33 @@ def go_round(
     timeout_s: float,
     moving: Sequence[Register],
     again_until_s: float = -math.inf,
+    *,
+    every_write: bool = False,
 ) -> Round:
     """Run the transactions one after the other; the first that fails ends the round.
 
-    A reply damaged by noise is requested once more, until ``again_until_s`` (control time).
+    A reply damaged by noise is requested once more, until ``again_until_s`` (control time). ``every_write``: after a
+    failure the remaining writes are sent all the same, and then the first error is raised. The line may lose the
+    replies only. A stop must then reach the drive, because the requests before its control word feed the watchdog.
 
     Raises CommunicationLost (NoReply, BadReply, LinkLost) and RegisterRefused.
     """
     words: dict[tuple[str, int], int] = {}
     sent_s: float | None = None
     received_s = longest_s = 0.0
+    failed: CommunicationLost | RegisterRefused | None = None
     for transaction in transactions:
-        answer = _patiently(access, transaction.request(image), timeout_s, str(transaction), again_until_s)
+        if failed is not None and transaction.write is None:
+            continue
+        try:
+            answer = _patiently(access, transaction.request(image), timeout_s, str(transaction), again_until_s)
+        except LinkLost:
+            raise
+        except (CommunicationLost, RegisterRefused) as error:
+            if not every_write:
+                raise
+            failed = failed or error
+            continue
         longest_s = max(longest_s, answer.received_s - answer.sent_s)
         span = transaction.read
         if span is None:
@@ -257,6 +272,8 @@ def go_round(
         if any(span.covers(register) for register in moving):
             sent_s = answer.sent_s if sent_s is None else sent_s
             received_s = answer.received_s
+    if failed is not None:
+        raise failed
     return Round(words, sent_s or 0.0, received_s, longest_s)
 
 

@@ -320,7 +320,10 @@ class ModbusDrive:
         if power_state(decode(control, status)) is not PowerState.FAULT:
             return
         for word in control.fault_reset:
-            self._access.write(self._profile.cycle.control.register_, word | control.speed_bits)
+            if control.fault_reset_register is not None:
+                self._access.write(control.fault_reset_register, word)
+            else:
+                self._access.write(self._profile.cycle.control.register_, word | control.speed_bits)
             self.clock.wait_until(self.clock.now_s() + RESET_PAUSE_S)
 
     def exchange(self, command: Command) -> Sample:
@@ -353,7 +356,7 @@ class ModbusDrive:
         try:
             got = go_round(
                 self._access, self._transactions(command.mode), image, self._timeout_s, self._moving,
-                begun_s + self.period_s,
+                begun_s + self.period_s, every_write=self._wish is not PowerRequest.ENABLED,
             )
         except (CommunicationLost, RegisterRefused) as error:
             self._missed += 1
@@ -460,8 +463,8 @@ class ModbusDrive:
     def poll(self) -> Sample | None:
         """Read without writing, for a stop whose cycles fail: a drive that refuses writes may still report its state.
 
-        While the drive shows itself enabled, the quick-stop word is written alone, once each time. The angle comes
-        last.
+        While the drive shows itself enabled, the quick-stop word is written alone, once each time. If the torque is
+        to be removed, the word for that is written instead, in any state with power. The angle comes last.
         """
         if not self._reads:
             return None
@@ -475,10 +478,9 @@ class ModbusDrive:
         except (CommunicationLost, RegisterRefused):
             return None
         self._take(self._codec.feedback(got.words), self._sent_mode)
-        if (
-            self._silent_since_s is None and self._wish is not PowerRequest.ENABLED
-            and power_state(self._state) in _MAY_DRIVE
-        ):
+        power = power_state(self._state)
+        pushed = power not in _NOT_DRIVEN if self._removes_torque else power in _MAY_DRIVE
+        if pushed and self._silent_since_s is None and self._wish is not PowerRequest.ENABLED:
             self._push()
         if self._feedback.position_rad is None and self._angle is not None:
             angle = self._angle.read(self._access, self._timeout_s)
@@ -498,9 +500,12 @@ class ModbusDrive:
         return found
 
     def _push(self) -> None:
-        """Write the control word of a quick stop alone, in the shortest request that the drive supports."""
+        """Write the control word of a quick stop alone, in the shortest request that the drive supports.
+
+        If the torque is to be removed, it is the word for that, as in a cycle: a quick stop would give it back.
+        """
         control = self._profile.cycle.control.register_
-        word = controlword_towards(
+        word = self._word(self._sent_mode) if self._removes_torque else controlword_towards(
             self._profile.control, self._state, PowerRequest.QUICK_STOP, self._sent_mode, reverse=self._reverse
         )
         try:
@@ -546,7 +551,8 @@ class ModbusDrive:
             raise CommunicationLost(
                 f"no good reply for {silent_s:.2f} s, last: {error.what}",
                 where=self._where,
-                next_step="Check cable, supply and termination; the drive's own watchdog stops the shaft",
+                next_step="Check cable, supply and termination. tdhil continues to send the quick stop. If no request"
+                " reaches the drive, its own watchdog stops the shaft",
                 entry=MessageCode.FEEDBACK_LOST,
             ) from error
 
