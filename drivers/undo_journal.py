@@ -1,4 +1,6 @@
-"""Journal of the settings that a run changes in a drive, written before each change and cleared by the restore.
+"""The settings that a run changes in a drive: how to undo them, and a journal of them on disk.
+
+The journal is written before each change and cleared by the restore.
 
 A host that is killed restores nothing. The file (one for each drive, in the log's folder) then shows what is left in
 the drive. `tdhil doctor` reports it, and the next run restores it before it reads the drive's limits. So a limit
@@ -11,16 +13,64 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from drivers.drive import Identity
-from drivers.errors import PreflightRefused
+from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from profiles import MessageCode
 
 PREFIX, SUFFIX = "drive-left-", ".json"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Undoing the changes of this run.
+
+
+class Undos:
+    """The changes of a run that were not restored yet, in their order."""
+
+    def __init__(self) -> None:
+        self._entries: list[tuple[list[str], Callable[[], None]]] = []
+
+    def add(self, names: list[str], undo: Callable[[], None]) -> None:
+        """Register ``undo``, which `restore` calls, with the names of its settings. The caller may add names later."""
+        self._entries.append((names, undo))
+
+    @property
+    def names(self) -> tuple[list[str], ...]:
+        """Names of the settings of each change."""
+        return tuple(names for names, _ in self._entries)
+
+    def restore(self, changed: Callable[[], tuple[str, ...]]) -> tuple[str, ...]:
+        """Undo every change, the last one first. Return those that could not be restored, a line each.
+
+        Without a connection no further change is undone. One line then names all that are left: ``changed()``.
+        """
+        failed: list[str] = []
+        while self._entries:
+            try:
+                self._entries[-1][1]()
+            except ObjectRefused as error:
+                failed.append(str(error))
+            except CommunicationLost as error:
+                failed.append(left_behind(changed(), error))
+                self._entries.clear()
+                break
+            self._entries.pop()
+        return tuple(failed)
+
+
+def left_behind(names: tuple[str, ...], error: Exception) -> str:
+    """Return one line: the settings that are left in the drive, and the error that prevented their restore."""
+    return f"{', '.join(names)}: {error}" if names else str(error)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The journal, for the next run.
 
 
 @dataclass(frozen=True)
@@ -64,9 +114,22 @@ class UndoJournal:
     def changing(self, where: str, before: bytes, after: bytes) -> None:
         """Record a setting before it is changed; the first former value is kept."""
         if self._path is not None:
-            known = self._entries.get(where)
-            self._entries[where] = Change(where, known.before if known is not None else before, after)
+            self._enter(where, before, after)
             self._save()
+
+    def changing_in_motion(self, where: str, before: bytes, after: bytes) -> None:
+        """Record a change in a cycle: without waiting for the disk, and without an error if the file can't be written.
+
+        The file survives the end of this process. A computer that loses its power may lose this change.
+        """
+        if self._path is not None:
+            self._enter(where, before, after)
+            with suppress(PreflightRefused):
+                self._save(wait=False)
+
+    def _enter(self, where: str, before: bytes, after: bytes) -> None:
+        known = self._entries.get(where)
+        self._entries[where] = Change(where, known.before if known is not None else before, after)
 
     def given_back(self, where: str) -> None:
         """Clear a setting that was restored, or changed by another tool."""
@@ -74,7 +137,7 @@ class UndoJournal:
             with suppress(PreflightRefused):       # a surplus entry does no harm: it is compared with the drive
                 self._save()
 
-    def _save(self) -> None:
+    def _save(self, *, wait: bool = True) -> None:
         assert self._path is not None
         try:
             if not self._entries:
@@ -91,7 +154,8 @@ class UndoJournal:
             with scratch.open("w", encoding="utf-8") as file:
                 json.dump(document, file, indent=1)
                 file.flush()
-                os.fsync(file.fileno())
+                if wait:
+                    os.fsync(file.fileno())
             scratch.replace(self._path)
         except OSError as error:
             raise PreflightRefused(

@@ -64,7 +64,7 @@ from drivers.errors import CommandRejected, CommunicationLost, DriveFault, Prefl
 from drivers.own_limits import OwnLimits
 from drivers.preflight import PreflightTable
 from drivers.standstill import standstill_limit_rad_s
-from drivers.undo_journal import UndoJournal
+from drivers.undo_journal import UndoJournal, left_behind
 from profiles import MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS, MessageCode
 from profiles.cia402 import Cia402Profile
 
@@ -674,16 +674,16 @@ class Cia402Drive:
         """
         self._bus.watch.stop()
         left: tuple[str, ...] = ()
-        state = self._reported.state
+        objects, state = self._bus.objects, self._reported.state
         disabled = state in _DISABLED or (state is State.NOT_READY and not self._power.ever_asked)
         try:
             if self._taken and disabled:
                 self._bus.release()
-                left = self._bus.objects.restore()
+                left = objects.restore()
             elif self._taken:
-                left = tuple(f"{one}: {NOT_RESTORED}" for one in self._bus.objects.changed)
+                left = tuple(f"{one}: {NOT_RESTORED}" for one in objects.changed)
         except (CommunicationLost, DriveFault) as error:
-            left = (str(error),)
+            left = (left_behind(objects.changed, error),)
         finally:
             self._bus.close()
         return left

@@ -9,8 +9,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from drivers.errors import CommunicationLost, ObjectRefused
-from drivers.undo_journal import UndoJournal
+from drivers.errors import ObjectRefused
+from drivers.undo_journal import UndoJournal, Undos
+
+MAPPING_FIRST, MAPPING_LAST = 0x1400, 0x1C1F
+"""Objects of PDOs (CiA 301: 1400h to 1BFFh) and of their assignment to sync managers (ETG.1000.6: 1C10h to 1C1Fh)."""
+NO_OBJECT = "the watchdog of the process data (register 0420h)"
+"""Name of a setting that is no object: only EtherCAT has one."""
 
 
 class Objects(ABC):
@@ -20,8 +25,9 @@ class Objects(ABC):
     """
 
     def __init__(self) -> None:
-        self._undo: list[Callable[[], None]] = []
+        self._undos = Undos()
         self._changed: set[tuple[int, int]] = set()
+        self._mapping: list[str] = []                  # mapping objects written since the last `on_restore`
         self.journal: UndoJournal | None = None        # records each change before it is made
         # bytes of each object as last read back, or as found if they were right
         self.stands: dict[tuple[int, int], bytes] = {}
@@ -62,6 +68,8 @@ class Objects(ABC):
         return int.from_bytes(self.rely_on(title, index, subindex), "little")
 
     def write(self, index: int, subindex: int, value: int, bits: int) -> None:
+        if MAPPING_FIRST <= index <= MAPPING_LAST:
+            self._mapping.append(name(index))
         self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))
 
     def change(self, index: int, subindex: int, value: int, bits: int) -> int:
@@ -87,6 +95,8 @@ class Objects(ABC):
     def _note_change(self, index: int, subindex: int, before: bytes, after: bytes) -> None:
         """Register the restore, and record the former value in case this host dies."""
         where = name(index, subindex)
+        if self.journal is not None:
+            self.journal.changing(where, before, after)
         if (index, subindex) not in self._changed:
             self._changed.add((index, subindex))
 
@@ -95,32 +105,30 @@ class Objects(ABC):
                 if self.journal is not None:
                     self.journal.given_back(where)
 
-            self.on_restore(give_back)
-        if self.journal is not None:
-            self.journal.changing(where, before, after)
+            self._undos.add([where], give_back)
+            self._mapping = []
 
     def on_restore(self, undo: Callable[[], None]) -> None:
-        """Register ``undo``, which `restore` calls."""
-        self._undo.append(undo)
+        """Register ``undo``, which `restore` calls.
+
+        Its names in messages are the mapping objects that `write` gets before the next undo; without any, `NO_OBJECT`.
+        """
+        self._mapping = []
+        self._undos.add(self._mapping, undo)
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """Return the names of the objects that `restore` would give back."""
-        return tuple(name(*one) for one in sorted(self._changed))
+        """Return the names of the settings that `restore` would give back, with one name for the whole PDO mapping."""
+        found = sorted({one for names in self._undos.names for one in names or (NO_OBJECT,)})
+        mapping = [one for one in found if one != NO_OBJECT and MAPPING_FIRST <= place(one)[0] <= MAPPING_LAST]
+        others = tuple(one for one in found if one not in mapping)
+        return (*others, f"the PDO mapping ({', '.join(mapping)})") if mapping else others
 
     def restore(self) -> tuple[str, ...]:
         """Undo every change, the last one first. Return the changes that could not be restored."""
-        failed = []
         self._changed.clear()
-        while self._undo:
-            try:
-                self._undo.pop()()
-            except ObjectRefused as error:
-                failed.append(str(error))
-            except CommunicationLost as error:
-                failed.append(f"{error} ({len(self._undo)} more settings were not restored)")
-                self._undo.clear()
-        return tuple(failed)
+        self._mapping = []
+        return self._undos.restore(lambda: self.changed)
 
 
 def _encoded(value: int, bits: int, where: str) -> bytes:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 from drivers.clock import Clock
-from drivers.drive import FrameTap, RawFrame
-from drivers.errors import CommunicationLost
+from drivers.drive import FrameTap, Identity, RawFrame
 from drivers.modbus import pdu as requests
-from drivers.modbus.codec import WordOrder, from_words, register_name, to_words
+from drivers.modbus.codec import RegisterType, WordOrder, from_words, register_name, to_words
 from drivers.modbus.link import Link
 from drivers.modbus.pdu import BUSY, BadReply, NoReply, RegisterRefused
+from drivers.preflight import PreflightTable
+from drivers.undo_journal import UndoJournal, Undos
 from profiles.modbus import Register
 
 SETTING_TIMEOUT_S = 1.0
@@ -20,6 +20,8 @@ TRIES = 3
 """Attempts of a request before motion without a valid reply."""
 BUSY_TRIES, BUSY_PAUSE_S = 5, 0.05
 """Attempts of a request that the drive delayed with exception 6, and the pause between them, s."""
+_TYPES: dict[int, RegisterType] = {2: "u16", 4: "u32"}
+"""Type of a register in the undo journal by the length of its value, bytes. The sign has no effect on the words."""
 
 
 class RegisterAnswer(NamedTuple):
@@ -45,7 +47,8 @@ class RegisterAccess:
         self._functions = functions
         self._tap = tap
         self.asked = 0                 # number of requests sent to this unit
-        self._undo: dict[tuple[str, int], Callable[[], None]] = {}
+        self.journal: UndoJournal | None = None        # records each change before it is made
+        self._undos = Undos()
 
     @property
     def clock(self) -> Clock:
@@ -112,31 +115,70 @@ class RegisterAccess:
         before = self.read(register)
         if before == counts:
             return before
-        self._undo.setdefault((register.table, register.address), lambda: self.write(register, before))
+        if self.journal is not None:
+            self.journal.changing(register_name(register), _bytes(register, before), _bytes(register, counts))
+        self._add_undo(register, before)
         self.write(register, counts)
         return self.read(register)
 
     def press(self, register: Register, counts: int, before: int, timeout_s: float) -> None:
         """Write counts once in a cycle. `restore` writes ``before`` back."""
-        self._undo.setdefault((register.table, register.address), lambda: self.write(register, before))
         words = to_words(counts, register.type, self._order)
+        if self.journal is not None:
+            self.journal.changing_in_motion(register_name(register), _bytes(register, before), _bytes(register, counts))
+        self._add_undo(register, before)
         self.once(self.write_request(register.address, words), timeout_s, register_name(register))
+
+    def _add_undo(self, register: Register, before: int) -> None:
+        """Register the restore of a register, unless it was changed before in this run."""
+        where = register_name(register)
+        if where in self.changed:
+            return
+
+        def give_back() -> None:
+            self.write(register, before)
+            if self.journal is not None:
+                self.journal.given_back(where)
+
+        self._undos.add([where], give_back)
 
     @property
     def changed(self) -> tuple[str, ...]:
         """Registers that differ from their former value."""
-        return tuple(f"register {address}" for _, address in self._undo)
+        return tuple(name for names in self._undos.names for name in names)
 
     def restore(self) -> tuple[str, ...]:
         """Undo every change, the last one first. Return the changes that could not be restored, a line each."""
-        failed: list[str] = []
-        while self._undo:
-            _, undo = self._undo.popitem()
+        return self._undos.restore(lambda: self.changed)
+
+    def restore_from(self, table: PreflightTable, journal: UndoJournal, identity: Identity) -> bool:
+        """Restore the settings that an earlier run left in the drive because its host died, if they are unchanged.
+
+        Later changes are recorded in the journal. Return whether a register was written.
+        """
+        given, others = [], []
+        for one in reversed(journal.opened(identity)):
+            address, kind = int(one.where.split()[1]), _TYPES[len(one.before)]
+            after, before = (to_words(int.from_bytes(data, "little"), kind, self._order)
+                             for data in (one.after, one.before))
             try:
-                undo()
+                if self.read_words("holding", address, len(after), one.where) == after:
+                    self.write_words(address, before, one.where)
+                    given.append(one.text)
+                else:
+                    others.append(one.where)
+                journal.given_back(one.where)
             except RegisterRefused as error:
-                failed.append(str(error))
-            except CommunicationLost as error:
-                failed.append(f"{error} ({len(self._undo)} more settings were not restored)")
-                self._undo.clear()
-        return tuple(failed)
+                table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive")
+        if given:
+            table.note("left by an earlier run", f"{', '.join(given)}: restored now", "log's folder")
+        if others:
+            table.note("left by an earlier run", f"{', '.join(others)}: changed since by another tool, not restored")
+        self.journal = journal
+        return bool(given)
+
+
+def _bytes(register: Register, counts: int) -> bytes:
+    """Return counts as the undo journal holds them: two bytes for each register, the low byte first."""
+    length = 2 * register.count
+    return (counts % (1 << 8 * length)).to_bytes(length, "little")

@@ -52,7 +52,7 @@ from drivers.modbus.cycle import (
 from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped, tell_stage
 from drivers.modbus.link import Link, late_replies
 from drivers.modbus.other_master import OtherMaster
-from drivers.modbus.parameters import find_filters, find_speed_loop, own_speed_limits, set_limits
+from drivers.modbus.parameters import find_filters, find_speed_loop, own_speed_limits, read_parameters, set_limits
 from drivers.modbus.pdu import BUSY, CycleRefused, LinkLost, RegisterRefused
 from drivers.modbus.position import AngleRegister, find_angle
 from drivers.modbus.preflight import check_setpoints, clear_setpoints
@@ -68,6 +68,7 @@ from drivers.modbus.temperature import Heat
 from drivers.modbus.watchdog import arm_watchdog, check_who_feeds, measure_pace
 from drivers.own_limits import SPEED, TORQUE, OwnLimits
 from drivers.preflight import PreflightTable
+from drivers.undo_journal import UndoJournal, left_behind
 from profiles import MessageCode
 from profiles.modbus import ModbusProfile, Register, StatusState
 
@@ -100,7 +101,8 @@ class ModbusDrive:
     """One unit on a link.
 
     ``rated_torque_nm`` replaces a value that the drive does not report. ``given`` holds the values of parameters that
-    can't be read over the bus (in the profile's units). ``tap`` gets every PDU.
+    can't be read over the bus (in the profile's units). ``tap`` gets every PDU. ``journal`` records the settings that
+    are changed in the drive, for restoring them after the host has died.
     """
 
     def __init__(
@@ -113,8 +115,10 @@ class ModbusDrive:
         rated_torque_nm: float | None = None,
         given: Mapping[str, float] | None = None,
         tap: FrameTap | None = None,
+        journal: UndoJournal | None = None,
     ) -> None:
         self.clock = link.clock
+        self._journal = journal
         self._asked_hz = rate_hz or profile.cycle.rate_hz
         self.period_s = round(1e6 / self._asked_hz) * 1e-6
         self._link = link
@@ -199,6 +203,9 @@ class ModbusDrive:
         filters = find_filters(table, profile, found)
         speed_loop = find_speed_loop(table, profile, found, simulated=self._identity.simulated)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
+            if self._journal is not None and access.restore_from(table, self._journal, self._identity):
+                # The limits read above were those of the dead run.
+                found = read_parameters(PreflightTable(), access, profile, self._given)
             set_limits(table, access, profile, limits, rated_nm, found, own)
             self._angle = find_angle(table, access, profile)
             if self._angle is not None:
@@ -662,16 +669,16 @@ class ModbusDrive:
         since is not known to be. Its watchdog stays armed then, and the silence that follows triggers it.
         """
         left: tuple[str, ...] = ()
-        power = power_state(self._state)
+        access, power = self._access, power_state(self._state)
         try:
             if power in _NOT_DRIVEN or (power in _NONE_YET and not self._ever_asked):
                 if self._modes:
-                    clear_setpoints(PreflightTable(), self._access, self._profile, self._off_word())
-                left = self._access.restore()
+                    clear_setpoints(PreflightTable(), access, self._profile, self._off_word())
+                left = access.restore()
             else:
-                left = tuple(f"{where}: {NOT_RESTORED}" for where in self._access.changed)
+                left = tuple(f"{where}: {NOT_RESTORED}" for where in access.changed)
         except CommunicationLost as error:
-            left = (str(error),)
+            left = (left_behind(access.changed, error),)
         finally:
             self._link.close()
         return left

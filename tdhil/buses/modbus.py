@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -199,16 +200,30 @@ def _address(options: RunOptions, connection: Connection) -> str | None:
 @contextmanager
 def _open(asked: Opening) -> Iterator[Drive]:
     """Open the line and the drive on it. The line is closed afterwards."""
-    with open_line(asked.plan, asked.connection, asked.data, asked.clock, asked.trace) as line:
+    from drivers.undo_journal import UndoJournal
+
+    plan, options, connection = asked.plan, asked.options, asked.connection
+    with open_line(plan, connection, asked.data, asked.clock, asked.trace) as line:
         yield driver.ModbusDrive(
             line.link,
             line.profile,
-            unit=line_of(asked.connection).unit,
-            rate_hz=asked.options.rate_hz,
+            unit=line_of(connection).unit,
+            rate_hz=options.rate_hz,
             rated_torque_nm=line.rated_torque_nm,
             given=line.given,
             tap=asked.tap,
+            journal=None if plan.embedded else UndoJournal(
+                plan.left_in or Path(options.log).parent, journal_address(line_of(connection), line.profile)),
         )
+
+
+def journal_address(line: ModbusLine, profile: ModbusProfile) -> str:
+    """Return the drive's part of the name of its undo journal: Modbus reports no serial number of a drive.
+
+    The profile belongs to it, because another profile may give another meaning to a register.
+    """
+    place = line.serial if line.host is None else f"{one_host(line.host)}-{line.port}"
+    return re.sub(r"[^\w.-]+", "-", f"{place}-unit{line.unit}-{profile.name}").strip("-")
 
 
 @contextmanager

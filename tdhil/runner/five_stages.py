@@ -6,7 +6,7 @@ The first cause is kept. Errors during the stop are reported beside it, never in
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -143,6 +143,9 @@ class Runner:
                 with suppress(Exception):
                     for line in left:
                         self._log.event(self._drive.clock.now_s(), "left", f"not restored: {line}")
+                if left:
+                    with suppress(Exception):
+                        self._say(_left_in_drive(left))
             if self._worker_process is not None:
                 self._worker_process.close()
             if cause is None and self._before_echo:
@@ -297,6 +300,16 @@ class Runner:
             self._log.failure(self._drive.clock.now_s(), error)
         except Exception as also:
             error.add_note(f"and this error could not be logged: {also}")
+
+
+def _left_in_drive(left: Iterable[str]) -> str:
+    """Return the message to the operator: the settings that were not restored, those with one reason together."""
+    names: dict[str, list[str]] = {}
+    for line in left:
+        name, _, reason = line.partition(": ")
+        names.setdefault(reason, []).append(name)
+    said = "; ".join(f"{', '.join(found)}: {reason}" for reason, found in names.items())
+    return f"not restored in the drive: {said}. Check these settings at the drive before the next run"
 
 
 def _refuse_undersampled(request: ExcitationRequest, period_s: float) -> None:
