@@ -1,4 +1,4 @@
-"""The file of the EtherCAT bus: its options, its section in rig.yaml, scan and doctor over a faked segment."""
+"""File of the EtherCAT bus: its options, its section in rig.yaml, scan and doctor over a fake segment."""
 
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ from tests.rigs import loaded_rig
 
 @pytest.fixture
 def segment(monkeypatch):
-    """Two slaves behind every interface; the second has an alias."""
+    """Put two slaves behind every interface; the second one has an alias."""
     slaves = [FakeSlave(alias=alias, clocks=True) for alias in (0, 7)]
     found = EthercatSegment(FakeMaster(*slaves), "eth9")
     said = SimpleNamespace(driven="", slaves=slaves)
@@ -37,7 +37,7 @@ def line_of(cli, text=None, tmp_path=None):
     return {name: value for name, value, _ in ethercat.ETHERCAT.line(cli, rig, None).rows()}
 
 
-def test_the_command_line_goes_before_the_rig(tmp_path):
+def test_the_command_line_takes_precedence_over_the_rig(tmp_path):
     rig = "ethercat: {interface: eth1, alias: 5}\n"
     assert line_of({}, rig, tmp_path) == {"interface": "eth1", "alias": "5"}
     assert line_of({"position": 2}, rig, tmp_path) == {"interface": "eth1", "position": "2"}
@@ -67,14 +67,14 @@ def test_options_of_another_bus_are_refused(capsys):
     assert main(["identify", "--drive", "ethercat", "--position", "300"]) == 2
 
 
-def test_scan_begins_a_rig(segment, capsys, tmp_path, monkeypatch):
+def test_scan_writes_a_starter_rig(segment, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["scan", "-i", "eth9", "--position", "1", "--write", "rig.yaml"]) == 0
     section = ethercat.ETHERCAT.section_of(load_rig(tmp_path / "rig.yaml"))
     assert (section.interface, section.position) == ("eth9", 1)
 
 
-def test_doctor_tells_segment_watchdog_and_clocks(segment, capsys):
+def test_doctor_reports_segment_watchdog_and_clocks(segment, capsys):
     main(["doctor", "-i", "eth9", "--position", "1"])
     out = capsys.readouterr().out
     for said in ("2 slaves answer", "PRE-OP", "100 ms are set", "the slave controller has them",
@@ -84,7 +84,7 @@ def test_doctor_tells_segment_watchdog_and_clocks(segment, capsys):
     assert "no slaves are with station alias 99" in capsys.readouterr().out
 
 
-def test_a_segment_that_another_master_drives_is_left_alone(segment, capsys):
+def test_a_segment_with_another_master_is_not_used(segment, capsys):
     segment.driven = "eth9, position 0: the slave is in OP"
     main(["doctor", "-i", "eth9", "--position", "1"])
     main(["scan", "-i", "eth9", "--position", "1"])
@@ -97,10 +97,10 @@ def test_nothing_is_written_by_scan_and_doctor(segment, capsys):
     main(["scan", "-i", "eth9", "--position", "0"])
     main(["doctor", "-i", "eth9", "--position", "0"])
     requests = [data[8] for slave in segment.slaves for manager, data in slave.heard if manager == 0]
-    assert set(requests) <= {0x40, 0x60, 0x70}                   # uploads alone
+    assert set(requests) <= {0x40, 0x60, 0x70}                   # uploads only
 
 
-def test_simulate_says_what_it_needs(monkeypatch, capsys):
+def test_simulate_names_its_requirements(monkeypatch, capsys):
     monkeypatch.setattr(ethercat.shutil, "which", lambda *_, **__: None)
     assert main(["scan", "--drive", "ethercat", "--simulate"]) != 0
     err = " ".join(capsys.readouterr().err.split())
@@ -108,7 +108,7 @@ def test_simulate_says_what_it_needs(monkeypatch, capsys):
     assert "--drive canopen" in err
 
 
-def test_a_run_without_an_interface_says_how_to_name_one(capsys):
+def test_a_run_without_an_interface_explains_how_to_name_one(capsys):
     assert main(["stop", "--drive", "ethercat", "--position", "0"]) == 2
     assert "-i eth1" in capsys.readouterr().err
 

@@ -1,6 +1,6 @@
-"""A third bus: everything that it needs stands in this file, and one line in each of two lists puts it in.
+"""Additional bus: all its code is in this file, and one entry in each of two lists adds it.
 
-No other file knows of it: command line, rig.yaml, run, log, scan, doctor and profile page take it from `BUSES`.
+No other file names it: command line, rig.yaml, run, log, scan, doctor and profile page use `BUSES`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[2]
 
 
 class Stated(ProfileEntry):
-    """A section of a toy's profile."""
+    """Section of the profile of the toy bus."""
 
     ends: Literal["off", "held"] = "held"
     kind: str = "lease"
@@ -45,7 +45,7 @@ class Stated(ProfileEntry):
 
 
 class ToyProfile(DriveProfile):
-    """What is known of a drive on the toy bus."""
+    """Profile of a drive on the toy bus."""
 
     bus: Literal["toy"]
     quick_stop: Stated
@@ -70,7 +70,7 @@ class ToyProfile(DriveProfile):
 
 
 class ToySection(DataModel):
-    """The section toy: of rig.yaml."""
+    """Section toy: of rig.yaml."""
 
     peg: int | None = Field(default=None, ge=1, le=99, description="where it hangs")
 
@@ -92,7 +92,7 @@ def _line(cli: Mapping[str, Any], rig: Rig | None, profile: Any) -> Line:
 
 @contextmanager
 def _open(asked: Opening) -> Iterator[Any]:
-    """Open the drive of `tests.runner.line_drive`, which no bus of ours knows."""
+    """Open the drive of `tests.runner.line_drive`, which no bus of tdhil has."""
     drive = LineDrive(SlowLine(0.1), seed=asked.plan.seed or 0, clock=asked.clock)
     OPENED.append(drive)
     asked.tap(RawFrame(0.0, True, 3, b"hello"))
@@ -111,7 +111,7 @@ def _parse_faults(texts: Sequence[str]) -> tuple[Any, ...]:
 
 
 class Peg:
-    """A value of the toy's."""
+    """Option value of the toy bus."""
 
     def cells(self) -> tuple[str, str, str, str]:
         return "peg 7", "1", "1 toy", "what it is"
@@ -168,7 +168,7 @@ TOY_BUS = Bus(
 
 @pytest.fixture
 def toy_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bus:
-    """Put the bus into both lists, and a profile of it into a folder."""
+    """Add the bus to both lists, and write one of its profiles to a folder."""
     monkeypatch.setitem(SCHEMAS, "toy", ToyProfile)
     monkeypatch.setitem(BUSES, "toy", BusEntry(f"{__name__}:TOY_BUS", "a toy"))
     monkeypatch.chdir(tmp_path)
@@ -182,7 +182,7 @@ def toy_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bus:
 
 
 @pytest.mark.heavy
-def test_a_run_on_a_toy_bus_goes_all_the_way(toy_bus, capsys):
+def test_a_run_on_a_toy_bus_is_complete(toy_bus, capsys):
     code = main(["identify", "--drive", "toy", "--simulate", "--seed", "3", "--json", "--model", "rigid",
                  "--excitation", "multisine", "--periods", "3"])
     out, err = capsys.readouterr()
@@ -196,11 +196,11 @@ def test_a_run_on_a_toy_bus_goes_all_the_way(toy_bus, capsys):
     logged = read_run(Path("run.mcap")).configuration
     assert (logged["drive"], logged["profile"]["name"]) == ("toy", "wood/toy")
     assert [frame.data for frame in read_frames(Path("run.mcap"))] == [b"hello"]
-    assert main(["export", "run.mcap", "--to", "candump"]) == 2           # the toy's frames are no CAN frames
+    assert main(["export", "run.mcap", "--to", "candump"]) == 2           # the frames of the toy bus are no CAN frames
     assert "contains no CAN frames" in capsys.readouterr().err
 
 
-def test_scan_and_doctor_ask_the_toy_bus(toy_bus, capsys):
+def test_scan_and_doctor_use_the_toy_bus(toy_bus, capsys):
     assert main(["scan", "--peg", "7", "--write", "rig.yaml"]) == 0
     assert "peg 7: a toy" in capsys.readouterr().out
     rig = load_rig(Path("rig.yaml"))
@@ -219,7 +219,7 @@ def test_scan_and_doctor_ask_the_toy_bus(toy_bus, capsys):
     assert "#toy: {peg: 7}" in Path("new.yaml").read_text()
 
 
-def test_rig_yaml_takes_the_section_of_the_toy_bus(toy_bus, capsys):
+def test_rig_yaml_accepts_the_section_of_the_toy_bus(toy_bus, capsys):
     Path("rig.yaml").write_text("toy: {peg: 7}\n")
     assert toy_bus.section_of(load_rig(Path("rig.yaml"))).peg == 7
     assert main(["stop", "--rig", "rig.yaml"]) == 8                 # the bus follows from the section
@@ -240,7 +240,7 @@ def test_python_opens_the_toy_bus(toy_bus):
         assert drive is not None
 
 
-def test_the_command_line_tells_a_toy_from_the_other_buses(toy_bus, capsys):
+def test_the_command_line_distinguishes_the_toy_bus_from_the_others(toy_bus, capsys):
     assert build_parser("identify").parse_args(["identify", "--drive", "toy"]).drive == "toy"
     assert main(["stop", "--peg", "7"]) == 8
     assert "peg 7: nobody there" in capsys.readouterr().err

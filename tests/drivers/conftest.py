@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture
 def fake_time(monkeypatch):
-    """Fake time in every file of the driver that looks at the clock; nothing outside it notices."""
+    """Fake time in every file of the driver that reads the clock; other code is not affected."""
     import drivers.canopen.drive  # noqa: F401  (all of its files are then loaded)
     from tests.drivers.scripted_drive import FakeTime
 
@@ -21,7 +21,7 @@ def fake_time(monkeypatch):
 
 @pytest.fixture
 def wire(fake_time):
-    """A fake bus with nobody on it."""
+    """Fake bus without any node."""
     from tests.drivers.scripted_drive import ScriptedBus
 
     return ScriptedBus(fake_time)
@@ -29,7 +29,7 @@ def wire(fake_time):
 
 @pytest.fixture
 def peer(wire):
-    """A scripted drive on the fake bus."""
+    """Scripted drive on the fake bus."""
     from tests.drivers.scripted_drive import ScriptedDrive
 
     return ScriptedDrive(wire)
@@ -44,7 +44,7 @@ def profile():
 
 @pytest.fixture
 def open_bench():
-    """Makes benches, of a class and its arguments, and closes them after the test."""
+    """Make benches from a class and its arguments, and close them after the test."""
     from tests.drivers.drive_benches import opened
 
     with opened() as make:
@@ -69,19 +69,19 @@ MAKERS = {
 
 
 @pytest.fixture(params=[
-    # One of each bus at once; the vendors' profiles, which CI tries as well, differ from them by what they declare. So
-    # does the drive in memory: EtherCAT's has the same inside.
+    # One bench per bus by default. The vendors' profiles, which CI tests too, differ by their declarations only. So
+    # does the drive in memory, which is also inside EtherCAT's bench.
     pytest.param(name, marks=() if name in ("canopen", "ethercat", "modbus") else pytest.mark.heavy)
     for name in sorted(MAKERS)
 ])
 def make_bench(request, open_bench):
-    """Makes benches of one kind of drive (see drive_benches); a further kind joins the contract by its line above."""
+    """Make benches of one kind of drive (see drive_benches). A line above adds a further kind to the contract tests."""
     return partial(open_bench, resolve_name(f"tests.drivers.{MAKERS[request.param]}"))
 
 
 @pytest.fixture
 def run(make_bench):
-    """A run on a quiet rig."""
+    """Run on a rig without noise."""
     from tests.drivers.drive_benches import Run
 
     return Run(make_bench())

@@ -1,12 +1,12 @@
-"""One bench for each kind of drive that must keep the contract: the drive, and independent eyes on the other side.
+"""One bench for each kind of drive of the contract tests: the drive, and independent access to the other side.
 
-A bench has ``drive`` (not yet connected), ``frames`` (what its tap saw), ``limits``, ``true_speed_rad_s``, and
+A bench has ``drive`` (not yet connected), ``frames`` (all frames of its tap), ``limits``, ``true_speed_rad_s``, and
 
-- ``settings()``: what stands in the drive, read by a client of the tests' own;
-- ``decode(frames)``: the feedback in the tapped frames as [(status, speed, torque, demand, mode)], one a cycle;
-- ``setpoints(frames)``: the setpoints in them as [(speed, torque)];
-- ``modes``; ``ends``, the state that a quick stop leaves the drive in, after a ramp of ``ramp_rad_s2``;
-- ``heard()``: what another station heard, as [(identifier, data)]; ``LEAST_FRAMES`` in 1,500 cycles.
+- ``settings()``: values in the drive, read by a client of the tests;
+- ``decode(frames)``: the feedback in the tapped frames as [(status, speed, torque, demand, mode)], one per cycle;
+- ``setpoints(frames)``: the setpoints in the frames as [(speed, torque)];
+- ``modes``; ``ends``: state of the drive after a quick stop with a ramp of ``ramp_rad_s2``;
+- ``heard()``: frames that another station received, as [(identifier, data)]; ``LEAST_FRAMES`` in 1,500 cycles.
 """
 
 import math
@@ -30,14 +30,14 @@ RPM = math.pi / 30.0
 
 
 class TamperedBus:
-    """A python-can bus between driver and wire: drops, delays and puts in frames on their way to the driver."""
+    """python-can bus between driver and wire that drops, delays and inserts frames to the driver."""
 
     def __init__(self, bus):
         self._bus = bus
         self.channel_info = bus.channel_info
         self.answers_at_once = getattr(bus, "answers_at_once", False)
         self.coming = deque()
-        self.change = lambda message: [message]       # what a frame becomes
+        self.change = lambda message: [message]       # replacement of a frame
         self.on_sync = lambda: None
         self.send_error = self.receive_error = None
 
@@ -78,7 +78,7 @@ class CanopenBench:
     )
     WATCHDOG = (0x1016, 1)
     LEAST_FRAMES = 4000
-    OWN_IDENTIFIERS = True         # by its identifier a frame's direction is known
+    OWN_IDENTIFIERS = True         # the identifier shows the direction of a frame
 
     PROFILE, WORN = "generic/cia402", False
     modes = frozenset({Mode.SPEED, Mode.TORQUE})
@@ -86,7 +86,7 @@ class CanopenBench:
     speed_lsb, torque_lsb = 0.1 * RPM, 1.0
     ramp_rad_s2 = LIMITS.quick_stop_rad_s2
     ramp_rel = 0.05
-    has_limits = True              # that a run can set
+    has_limits = True              # settings that a run can change
     safe_action = "quick_stop"
 
     def __init__(self, params=QUIET_RIG, *, seed=0, **options):
@@ -114,13 +114,13 @@ class CanopenBench:
         self.simulated.close()
 
     def foreign(self, identifier, data):
-        """A frame of somebody else on the bus."""
+        """Send a foreign frame on the bus."""
         self._second.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def heard(self):
-        """All that the second station has heard since it was last asked.
+        """Return all frames that the second station has received since the last call.
 
-        But for the questions (6FEh, 03h or 04h and a number) that a host puts on a busy computer: they are no part of
+        Requests of a host on a busy computer (6FEh, 03h or 04h and a number) are left out: they are no part of
         the run.
         """
         frames = []
@@ -176,7 +176,7 @@ def opened():
 
 
 class Run:
-    """Steps through the contract on a bench, with every sample kept."""
+    """Sequence of contract calls on a bench that keeps every sample."""
 
     def __init__(self, bench):
         self.bench, self.drive = bench, bench.drive
@@ -194,13 +194,13 @@ class Run:
         return sample
 
     def go(self, duration_s, mode=Mode.SPEED, speed=0.0, torque=0.0):
-        """Cycles for a while; the last sample."""
+        """Run cycles for a time and return the last sample."""
         for _ in range(round(duration_s / self.drive.period_s)):
             self.cycle(mode, speed, torque)
         return self.samples[-1]
 
     def until(self, wanted, within_s, mode=Mode.SPEED, speed=0.0, torque=0.0):
-        """Cycles until a sample is as wanted; that sample."""
+        """Run cycles until a sample meets the condition, and return it."""
         for _ in range(round(within_s / self.drive.period_s)):
             if wanted(self.cycle(mode, speed, torque)):
                 return self.samples[-1]
@@ -216,7 +216,7 @@ class Run:
         return self.go(for_s, speed=speed)
 
     def rests(self, sample):
-        """As the drive says: some switch themselves off once they are at rest."""
+        """Return whether the drive reports standstill or is disabled. Some drives disable themselves at standstill."""
         off = self.bench.ends is PowerState.OFF and sample.state is PowerState.OFF
         return sample.standstill or off
 

@@ -58,7 +58,7 @@ class EthercatBench:
 
     def decode(self, frames):
         shown = {9: Mode.SPEED, 10: Mode.TORQUE}
-        # The frames that bring the slave to OP, before the first cycle, are no cycles.
+        # The frames before the first cycle bring the slave to OP and are no cycles.
         found = [FEEDBACK.unpack(one.data) for one in frames if one.identifier == 3 and one.time_s > 0.0]
         return [(status, speed * LSB_RAD_S, torque * LSB_NM, demand * LSB_NM, shown.get(mode))
                 for status, torque, speed, mode, demand in found]

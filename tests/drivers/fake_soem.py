@@ -1,7 +1,7 @@
-"""A fake of the part of pysoem that `drivers.ethercat` uses: one slave controller with CoE, in this thread.
+"""Fake of the part of pysoem that `drivers.ethercat` uses: one slave controller with CoE, in this thread.
 
-Registers, mailbox and process image are typed here by hand from ETG.1000.4 and ETG.1000.6. The drive's inside is that
-of `memory_bench`. In stepped time each frame with setpoints moves the shaft on by 5FFEh:3.
+Registers, mailbox and process image are typed by hand from ETG.1000.4 and ETG.1000.6. The drive inside is that
+of `memory_bench`. In stepped time each frame with setpoints advances the shaft by 5FFEh:3.
 """
 
 import struct
@@ -189,7 +189,7 @@ class FakeMaster:
         self.present = slaves
         self.slaves, self.manual_state_change, self.closed = [], 0, False
         self.dc_time, self.expected_wkc, self.sent = 0, 0, None
-        self.counter = None            # what a wrong working counter becomes
+        self.counter = None            # reaction to a wrong working counter
 
     def open(self, ifname):
         self.interface = ifname

@@ -1,6 +1,6 @@
-"""Cia402Drive over a dictionary of objects in memory: the second fill-in of its contract, without any bus.
+"""Cia402Drive over a dictionary of objects in memory: the second implementation of its contract, without a bus.
 
-The drive's inside is the simulator's. Its objects, their units and the cyclic frame are typed here by hand.
+The drive inside is the simulator's. Its objects, their units and the cyclic frame are typed by hand here.
 """
 
 import math
@@ -31,7 +31,7 @@ SETPOINTS, FEEDBACK = struct.Struct("<Hhib"), struct.Struct("<Hhihb")
 
 
 class MemoryDrive:
-    """A drive as a dictionary of (index, sub-index): bytes, with hooks where an object does something."""
+    """Drive as a dictionary of (index, sub-index): bytes, with hooks for objects with a function."""
 
     def __init__(self, params, seed):
         self.application = application = Application(Inverter(params, np.random.default_rng(seed)))
@@ -85,7 +85,7 @@ class MemoryDrive:
             self.acts[key](int.from_bytes(data, "little", signed=key in self.live and key != (0x6040, 0)))
 
     def cycle(self, frame, period_s):
-        """Setpoints in, feedback out, and the shaft moves on by one period."""
+        """Take setpoints, return feedback, and advance the shaft by one period."""
         if frame is not None:
             word, torque, speed, mode = SETPOINTS.unpack(frame)
             for key, number in zip(((0x6060, 0), (0x6071, 0), (0x60FF, 0), (0x6040, 0)), (mode, torque, speed, word),
@@ -184,7 +184,7 @@ class MemoryBus(Cia402Bus):
 
 
 class MemoryBench:
-    """See `drive_benches` for what a bench offers."""
+    """Bench with the interface of `drive_benches`."""
 
     SETTINGS = (WATCHDOG, (0x6007, 0), (0x605A, 0), (0x6072, 0), (0x6080, 0), (0x6085, 0))
     TARGETS, MAPPING = ((0x6060, 0), (0x6071, 0), (0x60FF, 0)), ()

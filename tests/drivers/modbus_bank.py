@@ -1,6 +1,6 @@
-"""A Modbus drive of the tests' own: a bank of registers after the map of generic/modbus, typed by hand, no plant.
+"""Modbus drive for tests: a bank of registers with the map of generic/modbus, typed by hand, without a plant.
 
-Neither codec is used. What it misdoes is set on it by the test.
+It uses neither codec. A test sets its faults.
 """
 
 import struct
@@ -18,10 +18,10 @@ def high_and_low(number):
 
 
 class Bank:
-    """Unit 1. ``serve`` is what an `EmbeddedLink` asks; each transaction takes ``takes_s``.
+    """Unit 1. An `EmbeddedLink` calls ``serve``; each transaction takes ``takes_s``.
 
-    ``refuse`` maps a function to an exception code, ``refuse_at`` an address; ``deaf_to`` are addresses whose writes
-    are acknowledged and forgotten; ``script`` holds what becomes of the next replies: None is silence.
+    ``refuse`` maps a function to an exception code, ``refuse_at`` an address. Writes to the addresses ``deaf_to``
+    are acknowledged and ignored. ``script`` replaces the next replies; None is no reply.
     """
 
     def __init__(self, *, marker=True, takes_s=0.0):
@@ -95,7 +95,7 @@ class Bank:
         return None
 
     def show(self):
-        """Status, feedback, mode and the echoes of both setpoints, from what stands in the bank now."""
+        """Show status, feedback, mode and the echoes of both setpoints, from the present values of the bank."""
         words = self.words
         speed, torque = self.feedback()
         words[STATUS] = self.machine.status & ~0x0A00 | (0x0200 if self.remote else 0)

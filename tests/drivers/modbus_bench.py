@@ -1,4 +1,4 @@
-"""ModbusDrive on the embedded simulator that wears generic/modbus, over a line that takes no time, in stepped time.
+"""ModbusDrive on the embedded simulator with the profile generic/modbus, over a line without delay, in stepped time.
 
 Registers and formats are typed here by hand from the map in profiles/generic/modbus.yaml; neither codec is used.
 """
@@ -16,7 +16,7 @@ from tests.rigs import QUIET_RIG
 
 
 def driven(simulated, profile, clock=None):
-    """ModbusDrive on a simulated drive. It is told what no register of the profile tells."""
+    """Return a ModbusDrive on a simulated drive, with the values that no register of the profile contains."""
     return ModbusDrive(
         EmbeddedLink(simulated.serve, clock or SteppedClock()), profile, unit=simulated.unit,
         given=dict(simulated.untold), rated_torque_nm=None if profile.rated_torque else simulated.rated_torque_nm,
@@ -24,14 +24,14 @@ def driven(simulated, profile, clock=None):
 
 
 class ModbusBench:
-    """See `drive_benches` for what a bench offers."""
+    """Bench with the interface of `drive_benches`."""
 
     SETTINGS = (36, 37, 38, 39, 40, 41)
     MAPPING = ()
     TARGETS = (4, 0, 1, 2, 3)
     WATCHDOG = 40
-    LEAST_FRAMES = 3000            # one exchange of a request and a reply a cycle
-    OWN_IDENTIFIERS = False        # both directions bear the unit's number
+    LEAST_FRAMES = 3000            # one request and one reply per cycle
+    OWN_IDENTIFIERS = False        # both directions contain the unit's number
     modes = frozenset({Mode.SPEED, Mode.TORQUE})
     ends = PowerState.QUICK_STOP
     ramp_rad_s2, ramp_rel = LIMITS.quick_stop_rad_s2, 0.05
@@ -51,7 +51,7 @@ class ModbusBench:
         self._heard = []
         self.frames = []
         options.setdefault("rate_hz", 250.0)
-        self._ask(struct.pack(">BHH", 6, 4, 1))           # somebody has left it in torque mode
+        self._ask(struct.pack(">BHH", 6, 4, 1))           # an earlier user left it in torque mode
         self.drive = ModbusDrive(
             EmbeddedLink(self._serve, self.clock), profile, unit=1, tap=self.frames.append, **options
         )
@@ -74,12 +74,12 @@ class ModbusBench:
         self.simulated.close()
 
     def heard(self):
-        """All that went over the line since it was last asked."""
+        """Return all data on the line since the last call."""
         heard, self._heard = self._heard, []
         return heard
 
     def settings(self, keys=SETTINGS):
-        """Registers by 'address:0', as a station of the tests' own reads them."""
+        """Return the registers by 'address:0', read by a station of the tests."""
         found = {}
         for address in keys:
             function, size, value = struct.unpack(">BBH", self._ask(struct.pack(">BHH", 3, address, 1)))
@@ -88,7 +88,7 @@ class ModbusBench:
         return found
 
     def decode(self, frames):
-        """Cycles are function 23; preflight ends at the moment of its last write by another one."""
+        """Decode the cycles, which are function 23. Preflight ends with the last write by another function."""
         found, cycle = [], False
         armed_s = max((one.time_s for one in frames if one.outgoing and one.data[0] in (6, 16)), default=-1.0)
         for frame in frames:

@@ -1,7 +1,7 @@
-"""The other end of a Modbus line, by hand: a thread behind a loopback socket or a pty that answers as a test says.
+"""Peer of a Modbus line, by hand: a thread behind a loopback socket or a pty with the replies of a test.
 
-``behave(number, request)`` gets the number of the request (from 0) and its bytes as they stood on the line, and returns
-what is done: bytes are sent, numbers (seconds) and events waited for, functions called; RESET and CLOSE end the
+``behave(number, request)`` gets the number of the request (from 0) and its bytes on the line. It returns
+the reaction: bytes are sent, numbers (seconds) and events are waited for, functions called. RESET and CLOSE end the
 connection.
 """
 
@@ -38,7 +38,7 @@ def tcp(transaction, unit, pdu):
 
 
 class Peer(threading.Thread):
-    """Runs until it is left."""
+    """Peer that runs until the context ends."""
 
     def __init__(self, behave):
         super().__init__(daemon=True)
@@ -73,7 +73,7 @@ class Peer(threading.Thread):
 
 
 class TcpPeer(Peer):
-    """Listens on a free port of the loopback; serves one connection after the other."""
+    """Server on a free port of the loopback for one connection after the other."""
 
     def __init__(self, behave):
         super().__init__(behave)
@@ -114,7 +114,7 @@ class TcpPeer(Peer):
 
 
 class SerialPeer(Peer):
-    """The master side of a pty; ``device`` is the other one. Requests are told apart by their CRC."""
+    """Master side of a pty; ``device`` is the other one. The CRC separates requests."""
 
     def __init__(self, behave):
         super().__init__(behave)

@@ -12,7 +12,7 @@ TURN = Command(Mode.SPEED, 1.0, 0.0)
 
 
 def prepared(wire, profile, limits=LIMITS, clock=None, **options):
-    """A drive that preflight has refused nothing of. Without a clock it is stepped."""
+    """Return a drive after a preflight without a refusal. Without a clock it is stepped."""
     drive = CanopenDrive(wire, profile, clock or SteppedClock(), node=1, **options)
     drive.connect()
     assert drive.preflight(limits).refused == ()
@@ -26,7 +26,7 @@ def enabled(wire, profile, *arguments, **options):
 
 
 def cycles(drive, wire, count=20, command=TURN):
-    """Cycles with the heartbeat of the drive in each; the last sample."""
+    """Run cycles with the heartbeat of the drive in each, and return the last sample."""
     for _ in range(count):
         wire.put(0x701, b"\x05")
         sample = drive.exchange(command)

@@ -1,6 +1,6 @@
-"""The CiA 402 power drive state machine as the standard draws it, typed anew: what the tests hold the driver against.
+"""Power drive state machine of CiA 402, typed again from the standard, as the reference for the driver.
 
-Numbers are those of the transitions in CiA 402-2. One controlword makes at most one transition.
+The numbers are the transitions of CiA 402-2. One controlword causes at most one transition.
 """
 
 NOT_READY, OFF, READY, ON, ENABLED, STOPPING, REACTION, FAULT = (
@@ -8,7 +8,7 @@ NOT_READY, OFF, READY, ON, ENABLED, STOPPING, REACTION, FAULT = (
     "fault reaction active", "fault",
 )
 
-# xxxx xxxx x0xx 0000 and so on, of the standard's table: bits that count, and what they are.
+# Patterns of the standard's table, such as xxxx xxxx x0xx 0000: mask and values of the bits.
 STATUS_PATTERNS = {
     NOT_READY: "x0xx0000",
     OFF: "x1xx0000",
@@ -41,7 +41,7 @@ _TRANSITIONS = {
 
 
 def matches(low_byte: int, pattern: str) -> bool:
-    """Does a statusword's low byte fit a pattern such as x01x0111, bit 7 first?"""
+    """Return whether the low byte of a statusword fits a pattern such as x01x0111, bit 7 first."""
     return all(want in ("x", have) for want, have in zip(pattern, f"{low_byte:08b}", strict=True))
 
 
@@ -58,7 +58,7 @@ def command_of(word: int) -> str:
 
 
 class PowerMachine:
-    """Where a drive is. `step` is what it does by itself in a cycle, `obey` what a controlword does."""
+    """State of a drive. `step` makes its own transitions in a cycle, `obey` those of a controlword."""
 
     def __init__(self, state: str = OFF) -> None:
         self.state = state
@@ -82,5 +82,5 @@ class PowerMachine:
 
     @property
     def status(self) -> int:
-        """Don't-care bits as ones: who tests for equality instead of a mask fails."""
+        """Return the statusword with all undefined bits set: a test for equality instead of a mask fails."""
         return int(STATUS_PATTERNS[self.state].replace("x", "1"), 2) & ~0x80

@@ -1,4 +1,4 @@
-"""Benches of real drives' CANopen profiles: the simulated drive wears them; frames are taken apart by hand."""
+"""Benches of CANopen profiles of real drives: the simulated drive uses them. Frames are decoded by hand."""
 
 import struct
 
@@ -6,14 +6,14 @@ from drivers.drive import Mode, PowerState, RawFrame
 from tests.drivers.drive_benches import RPM, CanopenBench
 
 REMOTE = 1 << 30
-"""Set in the identifier of a remote frame, as SocketCAN does; the drive's answer has the same one without it."""
+"""Flag in the identifier of a remote frame, as in SocketCAN. The reply of the drive has the identifier without it."""
 
 
 class ProfileBench(CanopenBench):
     """Mode in TPDO2; status, torque and speed in TPDO1, as ``FEEDBACK`` has them."""
 
     FEEDBACK = "<Hhi"
-    MODES = ()                     # what is displayed: the mode it stands for
+    MODES = ()                     # displayed value: mode
 
     def decode(self, frames):
         found, mode, shown = [], 0, dict(self.MODES)
@@ -27,13 +27,13 @@ class ProfileBench(CanopenBench):
 
 
 class Epos4Bench(ProfileBench):
-    """rpm, thousandths of a rated torque that stands in µN·m, no 6074h, torque limit by current."""
+    """Bench with rpm, thousandths of a rated torque in µN·m, no 6074h, and a torque limit by current."""
 
     PROFILE, WORN = "maxon/epos4", True
     SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0))
     MODES = ((9, Mode.SPEED), (10, Mode.TORQUE))
     speed_lsb, torque_lsb = RPM, 1.0
-    brakes_in_torque_mode = False  # its quick stop lets go there: `Preflight.quick_stop_in_torque_mode`
+    brakes_in_torque_mode = False  # its quick stop coasts in torque mode: `Preflight.quick_stop_in_torque_mode`
     ramp_rad_s2 = 10.0 * RPM       # 1 rad/s² is 9.55 rpm/s, the next one up
 
     def setpoints(self, frames):
@@ -42,7 +42,7 @@ class Epos4Bench(ProfileBench):
 
 
 class S120Bench(ProfileBench):
-    """Encoder increments a second (2048 pulses x 2^11), torque in 5810h with 4000h = 1000 N·m, node guarding."""
+    """Bench with encoder increments per second (2048 pulses x 2^11), 5810h (4000h = 1000 N·m), and node guarding."""
 
     PROFILE, WORN = "siemens/s120-canopen", True
     SETTINGS = ((0x100C, 0), (0x100D, 0), (0x1017, 0), (0x6007, 0), (0x6072, 0), (0x25F1, 0), (0x243A, 0), (0x246F, 0))
@@ -72,7 +72,7 @@ class S120Bench(ProfileBench):
 
 
 class AbbBench(ProfileBench):
-    """Velocity mode: 6042h and 6044h in rpm, 16 bits; torque in thousandths, no limit and no ramp that can be set."""
+    """Bench in velocity mode: 6042h and 6044h in rpm, 16 bits; torque in thousandths, no adjustable limit or ramp."""
 
     PROFILE, WORN = "abb/acs880-fcan", True
     SETTINGS = ((0x1016, 1), (0x1017, 0))
@@ -83,7 +83,7 @@ class AbbBench(ProfileBench):
     FEEDBACK, MODES = "<Hhh", ((2, Mode.SPEED),)
     speed_lsb, torque_lsb = RPM, 1.0
     has_limits = False
-    ramp_rad_s2, ramp_rel = 3.0, 0.12      # the simulated drive's own, so steep that its speed loop lags behind
+    ramp_rad_s2, ramp_rel = 3.0, 0.12      # ramp of the simulated drive, too steep for its speed loop
     safe_action = "coast"
 
     def __init__(self, *args, **options):

@@ -1,6 +1,6 @@
-"""A drive of the tests' own, without a plant: a fake bus in fake time, an SDO server and PDOs typed by hand.
+"""Scripted drive without a plant: a fake bus in fake time, an SDO server and PDOs typed by hand.
 
-Nothing here uses the driver's codec, canopen or the simulator. What it misdoes is set on it by the test.
+It uses neither the driver's codec nor canopen nor the simulator. A test sets its faults.
 """
 
 import struct
@@ -17,7 +17,7 @@ RPDO1, TPDO1, TPDO2 = struct.Struct("<Hhi"), struct.Struct("<Hhi"), struct.Struc
 
 
 class FakeTime:
-    """Stands in for the module `time` in the driver's files: it moves when somebody waits."""
+    """Replacement of the module `time` in the driver's files: it advances by waits only."""
 
     CLOCK_BOOTTIME, CLOCK_MONOTONIC_RAW = 7, 4
 
@@ -36,7 +36,7 @@ class FakeTime:
 
 
 class ScriptedBus:
-    """Quacks like python-can's BusABC. Frames put in arrive when they are due; waiting for them moves the time."""
+    """Bus with the interface of python-can's BusABC. Frames arrive when they are due; waiting advances the time."""
 
     channel_info = "scripted bus"
 
@@ -64,7 +64,7 @@ class ScriptedBus:
     def recv(self, timeout: float = 0.0) -> can.Message | None:
         if self.receive_error is not None:
             raise self.receive_error
-        # At least a nanosecond, as a real wait: less could vanish in the sum, and time would stand still.
+        # At least a nanosecond, as a real wait. Less could vanish in the sum, and time would not advance.
         until_s = self.time.now_s + (max(timeout, 1e-9) if timeout > 0.0 else 0.0)
         if self.inbox and self.inbox[0][0] <= until_s:
             due_s, message = self.inbox.pop(0)
@@ -77,7 +77,7 @@ class ScriptedBus:
         self.closed = True
 
     def of(self, identifier: int) -> list[bytes]:
-        """All that was sent under one identifier."""
+        """Return all data sent with one identifier."""
         return [data for known, data in self.sent if known == identifier]
 
 
@@ -86,7 +86,7 @@ def u(value: int, size: int) -> bytes:
 
 
 class ScriptedDrive:
-    """Node 1. Objects are bytes; `refuse_read`, `refuse_write` map (index, sub) to an abort code."""
+    """Drive with node number 1. Objects are bytes; `refuse_read`, `refuse_write` map (index, sub) to an abort code."""
 
     def __init__(self, bus: ScriptedBus, *, marker: bool = True) -> None:
         self.bus = bus
@@ -133,7 +133,7 @@ class ScriptedDrive:
         return TPDO1.pack(self.machine.status | 0x1200, *self.feedback(cycle))
 
     def usual_feedback(self, cycle: int) -> list[tuple[float, bytes]]:
-        """(delay, data) of each TPDO1 that answers this SYNC."""
+        """Return (delay, data) of each TPDO1 that follows this SYNC."""
         return [(0.0002, self.tpdo(cycle))]
 
     def _sync(self) -> None:

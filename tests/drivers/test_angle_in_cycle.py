@@ -1,4 +1,4 @@
-"""The motor's angle as it comes with the cycle: which instant it is of, how it counts on, and where it doesn't come."""
+"""Motor angle in the cyclic data: its instant, its count over wraps, and drives that do not send it."""
 
 import itertools
 import math
@@ -33,7 +33,7 @@ def inverter(run):
 
 
 def with_true_angles(run, seconds, **setpoint):
-    """Cycles, and the true shaft's angle at the SYNC of each, which is before the drive moves on."""
+    """Run cycles; return them with the true angle of the shaft at each SYNC, before the drive advances."""
     found = []
     for _ in range(round(seconds / run.drive.period_s)):
         angle_rad = inverter(run).state.angle_rad
@@ -50,7 +50,7 @@ def brought(pairs):
 
 @pytest.mark.heavy
 def test_it_is_of_the_same_sync_as_speed_and_torque(made):
-    """To a count: one period later the shaft would be 15 counts further."""
+    """They agree to one count. One period later the shaft would be 15 counts further."""
     run = made(CanopenBench)
     found = run.turning(5.0)
     pairs = brought(with_true_angles(run, 2.0, speed=5.0))
@@ -62,7 +62,7 @@ def test_it_is_of_the_same_sync_as_speed_and_torque(made):
     assert found.state is run.samples[-1].state
 
 
-def test_it_is_what_the_frames_say(made):
+def test_it_is_the_angle_in_the_frames(made):
     run = made(CanopenBench)
     run.turning(5.0)
     run.bench.frames.clear()
@@ -125,12 +125,12 @@ def test_a_foreign_sync_shifts_it_and_it_is_found_again(made):
 
 
 def refusing(bench):
-    """The drive says 'cannot be mapped' (06040041h) to 6064h in a PDO."""
+    """Make the drive abort with 'cannot be mapped' (06040041h) for 6064h in a PDO."""
     store = bench.simulated.simulator.node.store
     store.variable(0x6064, 0).pdo_mappable = False
 
 
-def test_a_drive_that_does_not_let_it_be_mapped_is_asked_as_before(made):
+def test_a_drive_without_that_mapping_is_polled_as_before(made):
     run = made(CanopenBench)
     refusing(run.bench)
     found = run.ready()
@@ -151,7 +151,7 @@ def test_a_drive_that_does_not_let_it_be_mapped_is_asked_as_before(made):
     assert run.drive.read_position() is not None
 
 
-def test_it_gives_the_mapping_back(made):
+def test_it_restores_the_mapping(made):
     run = made(CanopenBench)
     run.drive.connect()
     used = [(index, sub) for index, sub in CanopenBench.MAPPING if sub < 2 or index & 0xFF00 in (0x1400, 0x1800)]
@@ -164,14 +164,14 @@ def test_it_gives_the_mapping_back(made):
 
 
 def test_a_wide_drive_has_no_room_for_both(made):
-    """Statusword, mode, demand and angle are nine bytes: the demand is left out, by rule."""
+    """Statusword, mode, demand and angle need nine bytes. The rule leaves the demand out."""
     wide = FrameShape(torque=(0x5830, 0, 32))
     assert Slow.fitting(True, STANDARD_POSITION, wide) == Slow(False, STANDARD_POSITION, True)
     assert Slow.fitting(True, None, wide) == Slow(True, None, True)
     assert Slow.fitting(True, STANDARD_POSITION, FrameShape()) == Slow(True, STANDARD_POSITION, False)
 
 
-def test_of_a_wide_drive_it_comes_with_every_cycle(made, monkeypatch):
+def test_from_a_wide_drive_it_comes_in_every_cycle(made, monkeypatch):
     monkeypatch.setattr(drive_benches, "load_canopen_profile", lambda name: wide_profile("i32"))
     run = made(S120Bench)
     found = run.ready()
@@ -191,8 +191,8 @@ def narrow_profile(**position):
 
 
 @pytest.mark.heavy
-def test_a_counter_that_starts_over_goes_on_counting(made, monkeypatch):
-    """16 bits, 4096 a turn: it starts over every 16 turns, 100 rad."""
+def test_a_counter_that_wraps_continues_to_count(made, monkeypatch):
+    """With 16 bits and 4096 counts per turn it wraps every 16 turns, or 100 rad."""
     profile = narrow_profile(type="u16")
     monkeypatch.setattr(drive_benches, "load_canopen_profile", lambda name: profile)
     monkeypatch.setattr(CanopenBench, "WORN", True)
@@ -207,8 +207,8 @@ def test_a_counter_that_starts_over_goes_on_counting(made, monkeypatch):
     assert told == pytest.approx(true, abs=0.004)
 
 
-def test_turns_that_can_not_be_known_are_not_given(made, monkeypatch):
-    """Half a turn, 52 ms for a half of that at twice the limit: at 20 Hz it comes every 0.1 s, which is too seldom."""
+def test_without_unique_turns_no_angle_is_given(made, monkeypatch):
+    """The range is half a turn. Twice the limit takes 52 ms for half of that; at 20 Hz it comes every 0.1 s."""
     profile = narrow_profile(type="u16", wrap_counts=2048.0)
     monkeypatch.setattr(drive_benches, "load_canopen_profile", lambda name: profile)
     monkeypatch.setattr(CanopenBench, "WORN", True)
@@ -220,7 +220,7 @@ def test_turns_that_can_not_be_known_are_not_given(made, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_a_look_brings_it_too(made):
+def test_a_poll_contains_it_too(made):
     run = made(CanopenBench)
     run.turning(5.0)
     first = brought(with_true_angles(run, 0.1, speed=5.0))[-1]
@@ -240,7 +240,7 @@ def frame(counts):
 def test_it_is_waited_for_in_the_cycle_in_which_it_is_due():
     slow = SlowFeedback(Slow(True, STANDARD_POSITION), 5)
     slow.begin()
-    assert not slow.due                        # nobody knows when it comes
+    assert not slow.due                        # the time of its arrival is unknown
     slow.take(frame(7), True)
     waited = []
     for cycle in range(1, 40):
@@ -249,7 +249,7 @@ def test_it_is_waited_for_in_the_cycle_in_which_it_is_due():
         if slow.due:
             waited.append(cycle)
     assert waited == [5 * k for k in range(1, FORGOTTEN + 1)]
-    assert slow.take(frame(8), False) == ModeAndDemand(9, 5)       # of the SYNC before
+    assert slow.take(frame(8), False) == ModeAndDemand(9, 5)       # from the SYNC before
     for _ in range(3):
         slow.begin()
         assert not slow.due
@@ -257,8 +257,8 @@ def test_it_is_waited_for_in_the_cycle_in_which_it_is_due():
     assert slow.due
 
 
-def test_what_is_shown_by_one_that_was_waited_for_counts_from_the_next_cycle_on():
-    """As it did when nobody waited: a run repeats to the last bit."""
+def test_values_of_a_tpdo2_that_was_waited_for_count_from_the_next_cycle_on():
+    """This is the same as without the wait, so a run repeats to the last bit."""
     slow = SlowFeedback(Slow(True, STANDARD_POSITION), 1)
     slow.begin()
     slow.take(frame(7), True)
@@ -282,7 +282,7 @@ def beside(address):
     return ModbusProfile.model_validate(data)
 
 
-def test_it_rides_along_where_that_is_free_and_beside_the_speed():
+def test_it_is_read_beside_the_speed_if_that_costs_no_request():
     assert texts(plan_cycle(beside(21), position=True).cycle) == ["23 writes 0+5 reads 16+7"]
     assert plan_cycle(beside(21), position=True).has_position
     for plan in (plan_cycle(beside(21)), plan_cycle(beside(22), position=True), plan_cycle(beside(52), position=True)):
@@ -332,7 +332,7 @@ def test_turns_are_counted_both_ways():
     assert told == pytest.approx([0.0, 2.5, 5.0, 9.0, 13.5, 11.0])
 
 
-def test_after_a_gap_a_reading_is_not_known_and_those_after_it_are_right_but_for_whole_turns():
+def test_after_a_gap_one_reading_is_unknown_and_the_next_ones_may_lack_whole_turns():
     angle = Unwrapped(10.0, 15.0)
     assert angle.take(0.0, 1.0) == 0.0
     assert angle.take(1.0, 4.0) is None
@@ -341,7 +341,7 @@ def test_after_a_gap_a_reading_is_not_known_and_those_after_it_are_right_but_for
     assert angle.take(1.2, 6.0) == pytest.approx(5.0)
 
 
-def test_a_counter_without_an_end_bears_any_gap():
+def test_a_counter_without_a_wrap_tolerates_any_gap():
     angle = Unwrapped(None, 15.0)
     assert longest_gap_s(None, 15.0) == longest_gap_s(10.0, 0.0) == math.inf
     assert [angle.take(0.0, 3.0), angle.take(1e6, 5003.0)] == [0.0, 5000.0]

@@ -1,4 +1,4 @@
-"""An adapter that takes no frames: `send` of python-can must end, and nothing more is sent."""
+"""Adapter that accepts no frames: `send` of python-can must end, and no more frames are sent."""
 
 import os
 import socket
@@ -16,7 +16,7 @@ from drivers.errors import CommunicationLost
 
 pty = pytest.importorskip("pty", reason="a serial line of two ends")
 HANGS_S = 10.0
-"""Time after which the other end closes, s: a send without a limit then fails in another way."""
+"""Time after which the other end closes, s. A send without a limit then fails in another way."""
 MOST_FRAMES = 100_000
 
 
@@ -30,7 +30,7 @@ def closing_in_the_end(close):
 
 @pytest.fixture
 def slcan():
-    """An slcan adapter that reads nothing: the other end of its serial line."""
+    """slcan adapter that reads nothing: the other end of its serial line."""
     adapter, line = pty.openpty()
     bus = can.Bus(interface="slcan", channel=os.ttyname(line), sleep_after_open=0.0)
     end = os.fdopen(adapter, "rb")
@@ -44,7 +44,7 @@ def slcan():
 
 
 def fill(link):
-    """Send until the adapter takes no more. Return the error."""
+    """Send until the adapter accepts no more frames. Return the error."""
     for _ in range(MOST_FRAMES):
         try:
             link.send(0x201, bytes(8))
@@ -76,7 +76,7 @@ def test_nothing_more_is_sent_behind_a_part_of_a_frame(slcan):
 
 
 class Port:
-    """A serial port whose adapter takes nothing out of the buffer."""
+    """Serial port whose adapter reads nothing from the buffer."""
 
     out_waiting = 27
     write_timeout = None

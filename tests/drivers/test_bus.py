@@ -1,4 +1,4 @@
-"""Every frame in and out, in order; what the bus misdoes becomes one error that says what to do."""
+"""Every received and sent frame, in order. Each fault of the bus becomes one error with the next step."""
 
 import can
 import pytest
@@ -67,7 +67,7 @@ def test_handlers_get_their_identifier_only(wire, link):
 
 @pytest.mark.parametrize("kind", ["is_extended_id", "is_remote_frame", "is_error_frame"])
 def test_frames_that_are_no_canopen_data_reach_no_handler(wire, link, kind):
-    """29 bits with the same number; a foreign master's node guarding; an error frame."""
+    """The frames are 29-bit with the same number, node guarding of another master, and an error frame."""
     got = []
     link.handlers[0x701] = got.append
     wire.put(0x701, b"", **{kind: True})
@@ -76,13 +76,13 @@ def test_frames_that_are_no_canopen_data_reach_no_handler(wire, link, kind):
     assert link.error_frames == (kind == "is_error_frame")
 
 
-def test_nothing_to_receive_takes_as_long_as_was_said(wire, link, fake_time):
+def test_a_receive_without_a_frame_takes_the_stated_time(wire, link, fake_time):
     begin_s = fake_time.now_s
     assert link.receive(0.25) is None
     assert fake_time.now_s - begin_s == pytest.approx(0.25)
 
 
-def test_pumping_ends_in_time_though_others_talk(wire, link, fake_time):
+def test_pumping_ends_in_time_despite_other_traffic(wire, link, fake_time):
     begin_s = fake_time.now_s
     for k in range(100):
         wire.put(0x123, b"x", 0.01 * k)
@@ -99,21 +99,21 @@ def test_pumping_ends_at_once_when_it_is_done(wire, link, fake_time):
     assert fake_time.now_s - begin_s == pytest.approx(0.1)
 
 
-def test_in_stepped_time_a_host_that_was_frozen_takes_nobody_for_dead(wire, link, fake_time):
-    """The peer has answered, or is about to: that this computer wasn't there tells nothing about it."""
+def test_in_stepped_time_a_host_that_was_frozen_declares_no_peer_dead(wire, link, fake_time):
+    """The peer has replied or will reply. An absence of this computer shows nothing about the peer."""
     got, recv = [], wire.recv
     link.asks, link.handlers[0x181] = True, got.append
 
     def frozen(timeout):
         wire.recv = recv
-        fake_time.sleep(10.0 * PEER_DEAD_S)        # and the wait is over, with nothing read
+        fake_time.sleep(10.0 * PEER_DEAD_S)        # and the wait is over without a received frame
         wire.put(0x181, b"x", 0.001)
 
     wire.recv = frozen
     assert link.await_answer(lambda: bool(got), 0.1)
 
 
-def test_in_stepped_time_a_peer_that_says_nothing_is_dead_in_the_end(wire, link, fake_time):
+def test_in_stepped_time_a_silent_peer_is_finally_dead(wire, link, fake_time):
     link.asks = True
     for waits_s in (PEER_DEAD_S, PEER_STILL_DEAD_S):
         begin_s = fake_time.now_s
@@ -121,7 +121,7 @@ def test_in_stepped_time_a_peer_that_says_nothing_is_dead_in_the_end(wire, link,
         assert fake_time.now_s - begin_s == pytest.approx(waits_s, abs=1e-6)
 
 
-def test_a_stepped_peer_that_answers_at_once_is_not_waited_for(wire, frames, fake_time):
+def test_a_stepped_peer_that_replies_at_once_causes_no_wait(wire, frames, fake_time):
     wire.answers_at_once = True
     link, begun_s = CanLink(wire, SteppedClock(), frames.append), fake_time.monotonic()
     link.asks = True

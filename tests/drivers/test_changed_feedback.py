@@ -1,4 +1,4 @@
-"""TPDOs that a tool or a panel changes in mid-run: mapping, transmission type, COB-ID; and feedback that gets thin."""
+"""TPDOs that a tool or a panel changes during a run: mapping, transmission type, COB-ID; and sparse feedback."""
 
 import itertools
 import random
@@ -24,14 +24,14 @@ def run(bench):
 
 
 def panel(run, *writes):
-    """The drive's own panel: nothing of it is on the bus."""
+    """Change an object by the panel of the drive, without frames on the bus."""
     store = run.bench.simulated.simulator.node.store
     for index, sub, value in writes:
         store.write(index << 8 | sub, value)
 
 
 def tool(run, index, sub, value, size):
-    """A tool's SDO on the same bus (CiA 301, expedited download)."""
+    """Send the SDO of a tool on the same bus (CiA 301, expedited download)."""
     command = {1: 0x2F, 2: 0x2B, 4: 0x23}[size]
     run.bench.foreign(0x601, struct.pack("<BHBI", command, index, sub, value))
 
@@ -44,7 +44,7 @@ def until_lost(run, seconds):
 
 
 REMAPPED = ((0x1800, 1, DISABLED | 0x181), (0x1A00, 0, 0), (0x1A00, 2, 0x60740010), (0x1A00, 0, 3), (0x1800, 1, 0x181))
-"""The demanded torque in place of the reported one: a frame of the same length."""
+"""Mapping with the demanded torque instead of the reported one, in a frame of the same length."""
 
 
 @pytest.mark.long(but_first=3)
@@ -56,7 +56,7 @@ REMAPPED = ((0x1800, 1, DISABLED | 0x181), (0x1A00, 0, 0), (0x1A00, 2, 0x6074001
     (((0x1801, 2, 100),), "1801h:2", ("TPDO2", "5 was set, 100 (64h) is there now")),
     (((0x1801, 1, DISABLED | 0x281),), "1801h:1", ("TPDO2", "80000281h")),
 ])
-def test_what_the_panel_changes_is_found_within_a_round_and_named(run, writes, where, words):
+def test_a_change_by_the_panel_is_found_within_a_round_and_named(run, writes, where, words):
     if writes[0][1] == 3:
         writes = ((0x1800, 1, DISABLED | 0x181), *writes, (0x1800, 1, 0x181))
     panel(run, *writes)
@@ -71,7 +71,7 @@ def test_what_the_panel_changes_is_found_within_a_round_and_named(run, writes, w
 @pytest.mark.parametrize(("index", "sub", "value", "size"), [
     (0x1800, 2, 10, 1), (0x1801, 2, 100, 1), (0x1800, 5, 7, 2),
 ])
-def test_what_a_tool_is_heard_to_write_is_found_at_once(run, index, sub, value, size):
+def test_a_received_write_of_a_tool_is_found_at_once(run, index, sub, value, size):
     tool(run, index, sub, value, size)
     error, took_s = until_lost(run, 1.0)
     assert f"{index:04X}h:{sub}" in error.where
@@ -80,7 +80,7 @@ def test_what_a_tool_is_heard_to_write_is_found_at_once(run, index, sub, value, 
 
 @pytest.mark.heavy
 def test_a_whole_remapping_on_the_bus_is_stopped_while_it_is_under_way(run):
-    """Its first write switches the TPDO off: that is seen, and written back."""
+    """The first write disables the TPDO. tdhil finds this and restores the value."""
     tool(run, 0x1800, 1, DISABLED | 0x181, 4)
     error, took_s = until_lost(run, 1.0)
     assert "1800h:1" in error.where
@@ -103,8 +103,8 @@ def test_frames_of_another_mapping_are_not_believed_any_more(run):
 
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("every", [3, 8, 100])
-def test_feedback_that_is_too_thin_ends_the_run_within_a_second(run, every):
-    """The read-back may be far from its turn."""
+def test_feedback_that_is_too_sparse_ends_the_run_within_a_second(run, every):
+    """The read-back of this object may come much later."""
     run.drive._read_back._over = True
     panel(run, (0x1800, 2, every))
     error, took_s = until_lost(run, 3.0)
@@ -114,7 +114,7 @@ def test_feedback_that_is_too_thin_ends_the_run_within_a_second(run, every):
 
 
 @pytest.mark.heavy
-def test_rest_is_seen_by_sdo_while_feedback_is_thin(run):
+def test_standstill_is_polled_by_sdo_while_feedback_is_sparse(run):
     run.drive._read_back._over = True
     number = itertools.count(1)
     run.bench.bus.change = lambda message: (
@@ -135,7 +135,7 @@ def test_rest_is_seen_by_sdo_while_feedback_is_thin(run):
 
 
 @pytest.mark.heavy
-def test_the_transmission_type_is_put_back_for_the_stop(run):
+def test_the_transmission_type_is_restored_for_the_stop(run):
     run.drive._read_back._over = True
     panel(run, (0x1800, 2, 8))
     until_lost(run, 3.0)
@@ -148,7 +148,7 @@ def test_the_transmission_type_is_put_back_for_the_stop(run):
 @pytest.mark.heavy
 @pytest.mark.parametrize("lost", [0.01, 0.1])
 def test_a_bus_that_loses_frames_runs_on(run, lost):
-    """Row 17: one to ten percent."""
+    """Row 17: a loss of one to ten percent."""
     rng = random.Random(5)
     run.bench.bus.change = lambda message: [] if message.arbitration_id == 0x181 and rng.random() < lost else [message]
     run.go(ROUND_S, speed=2.0)

@@ -1,4 +1,4 @@
-"""What `drivers.cia402` does beyond the contract suite, over a dictionary of objects: no frame, no identifier."""
+"""Behaviour of `drivers.cia402` beyond the contract suite, over a dictionary of objects without frames."""
 
 import ast
 import subprocess
@@ -31,8 +31,8 @@ def test_it_loads_no_bus():
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
-def test_the_drive_in_memory_fills_the_contract_in_under_two_hundred_lines():
-    """Lines of code: without blank lines, comments and docstrings."""
+def test_the_drive_in_memory_implements_the_contract_in_under_two_hundred_lines():
+    """The count is of code, without blank lines, comments and docstrings."""
     tree = ast.parse((Path(__file__).parent / "memory_bench.py").read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
@@ -61,7 +61,7 @@ def lost(run, within_s):
     ((0x605A, 0), b"\0\0", "the quick-stop option"),
     ((0x2100, 0), b"\0\0", "the drive's watchdog"),
 ])
-def test_a_setting_that_another_hand_changes_ends_the_run_and_is_put_back(run, key, data, title):
+def test_a_setting_that_another_master_changes_ends_the_run_and_is_restored(run, key, data, title):
     run.turning(5.0)
     before = run.bench.memory.read(key)
     run.bench.memory.write(key, data)
@@ -70,7 +70,7 @@ def test_a_setting_that_another_hand_changes_ends_the_run_and_is_put_back(run, k
     assert run.bench.memory.read(key) == before
 
 
-def test_a_setpoint_that_another_hand_writes_ends_the_run(run):
+def test_a_setpoint_that_another_master_writes_ends_the_run(run):
     run.turning(5.0)
     run.bench.memory.live[0x60FF, 0] = ("<i", lambda: 123)
     assert "the target velocity is not what this host sent" in lost(run, 20.0).what
@@ -92,7 +92,7 @@ def test_a_host_that_feeds_no_more_leaves_the_shaft_to_the_watchdog(run):
 
 
 def test_a_quick_stop_that_another_master_reverses_is_written_as_an_object(run):
-    """Its setpoints reach the drive after ours, in every cycle, until all of them are disabled."""
+    """Its setpoints reach the drive after those of the host in every cycle, until all RPDOs are disabled."""
     run.turning(5.0)
     memory, bus = run.bench.memory, run.drive._bus
     cycle = memory.cycle
@@ -111,7 +111,7 @@ def test_a_quick_stop_that_another_master_reverses_is_written_as_an_object(run):
 
 
 def test_a_stop_outside_of_any_run_needs_objects_alone(run):
-    """Each reading moves the simulated time on."""
+    """Each reading advances the simulated time."""
     run.turning(5.0)
     memory, clock, period_s = run.bench.memory, run.drive.clock, run.drive.period_s
     memory.write((0x2100, 0), b"\0\0")

@@ -30,7 +30,7 @@ def test_monotonic_time(fake_time):
     assert clock.now_s() == pytest.approx(0.5)
 
 
-def test_how_late_a_wait_came_back(fake_time):
+def test_the_delay_of_a_wait(fake_time):
     clock = MonotonicClock()
     fake_time.sleep(3.0)
     assert clock.wait_until(1.0) == pytest.approx(2.0)
@@ -46,7 +46,7 @@ def test_the_wall_clock_plays_no_part(monkeypatch):
 
 
 class SleepingComputer:
-    """The module `time` of a computer that sleeps: only the clock named here goes on meanwhile."""
+    """Module `time` of a computer that sleeps: only the named clock advances during the sleep."""
 
     def __init__(self, goes_on):
         self.names = ["CLOCK_MONOTONIC", "CLOCK_MONOTONIC_RAW", *{goes_on} - {"CLOCK_MONOTONIC_RAW"}]
@@ -65,7 +65,7 @@ class SleepingComputer:
 
 
 @pytest.mark.parametrize(("platform", "goes_on"), [("linux", "CLOCK_BOOTTIME"), ("darwin", "CLOCK_MONOTONIC_RAW")])
-def test_a_computer_that_slept_in_mid_run_is_seen(monkeypatch, platform, goes_on):
+def test_a_computer_that_slept_during_a_run_is_found(monkeypatch, platform, goes_on):
     computer = SleepingComputer(goes_on)
     monkeypatch.setattr(clock_module, "time", computer)
     monkeypatch.setattr(clock_module, "_now_s", clock_module._clock_with_sleep(platform))

@@ -1,4 +1,4 @@
-"""What both CiA 402 buses share: places of values in cyclic data, and SDO messages, against bytes typed by hand."""
+"""Common code of both CiA 402 buses, against bytes typed by hand: places of values in cyclic data, and SDO messages."""
 
 import pytest
 
@@ -38,7 +38,7 @@ def test_an_object_of_another_length_has_no_place():
 
 
 class Client(SdoClient):
-    """A client whose drive gives these answers."""
+    """Client whose drive gives these replies."""
 
     def __init__(self, *answers, normal):
         super().__init__(0.5, (3, 1), normal=normal, drive="node 5")
@@ -124,7 +124,7 @@ def test_a_refusal_names_the_value_or_the_read_request():
 @pytest.mark.parametrize(("message", "found"), [
     ("4b72600034120000", (0x6072, 0, b"\x34\x12")),
     ("8072600000000206", (0x6072, 0, None)),
-    ("4108100009000000", None),                                      # its data come in segments
+    ("4108100009000000", None),                                      # its data are in segments
     ("6072600000000000", None),
     ("4b", None),
 ])

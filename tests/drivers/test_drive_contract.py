@@ -1,4 +1,4 @@
-"""What every `drivers.drive.Drive` must do, whatever its bus: the contract, once, for each bench in conftest."""
+"""Contract of every `drivers.drive.Drive`, for each bench in conftest."""
 
 import itertools
 import math
@@ -17,7 +17,7 @@ VISCOUS, COULOMB, INERTIA = 8.0, 60.0, 104.0       # the simulated rig
 
 @pytest.fixture
 def torque_run(run):
-    """A drive that can regulate torque; the others refuse to, which is all that there is to see on them."""
+    """Return a run with torque mode. For a drive without it, check the refusal and skip the test."""
     if Mode.TORQUE not in run.bench.modes:
         run.ready()
         with pytest.raises(PreflightRefused, match="torque"):
@@ -29,7 +29,7 @@ def torque_run(run):
 
 
 def other_mode(run):
-    """Torque where the drive has it."""
+    """Return torque mode if the drive has it."""
     return Mode.TORQUE if Mode.TORQUE in run.bench.modes else Mode.SPEED
 
 
@@ -46,7 +46,7 @@ def test_identity_and_preflight(run):
     assert found.speed_resolution_rad_s == pytest.approx(run.bench.speed_lsb)
     assert found.watchdog_s == run.bench.limits.watchdog_s
     assert found.safe_action == run.bench.safe_action
-    # Where the drive stays after a quick stop was written down by hand for each bench.
+    # The state after a quick stop is stated by hand for each bench.
     assert found.quick_stop_holds is (run.bench.ends is PowerState.QUICK_STOP)
     assert all(check.where for check in found.checks if check.outcome is not Outcome.NOTE)
 
@@ -113,12 +113,12 @@ def test_switching_modes_both_ways_is_bumpless_and_confirmed(torque_run):
     run.go(1.0, Mode.SPEED, run.samples[-1].speed_rad_s, seed)
     after = [sample for sample in run.samples if sample.time_s > steady.time_s]
     assert {sample.state for sample in after} == {PowerState.ENABLED}
-    # Half a count of the speed that it is switched at is a kick of the speed loop's.
+    # At the switch, half a count of speed causes a step in the torque of the speed loop.
     assert max(abs(sample.torque_nm - seed) for sample in after) < max(8.0, 0.55 * SPEED_GAIN * run.bench.speed_lsb)
     assert max(abs(sample.speed_rad_s - 5.0) for sample in after) < max(0.05, 1.3 * run.bench.speed_lsb)
 
 
-def test_the_mode_that_is_shown_is_the_drives(torque_run):
+def test_the_displayed_mode_is_that_of_the_drive(torque_run):
     run = torque_run
     run.ready()
     run.enable(Mode.TORQUE)
@@ -126,7 +126,7 @@ def test_the_mode_that_is_shown_is_the_drives(torque_run):
     assert run.go(0.2, Mode.SPEED).mode is Mode.SPEED
 
 
-def test_the_limits_stand_in_the_drive_and_act(run):
+def test_the_limits_are_in_the_drive_and_effective(run):
     if not run.bench.has_limits:
         pytest.skip("a drive whose limits are set by hand")
     run.ready()
@@ -160,7 +160,7 @@ def test_a_quick_stop_brakes_on_the_ramp_and_holds(run, mode):
     ramp = (fall[0].speed_rad_s - fall[-1].speed_rad_s) / (fall[-1].time_s - fall[0].time_s)
     assert ramp == pytest.approx(run.bench.ramp_rad_s2, rel=run.bench.ramp_rel)
     assert {sample.state for sample in fall} == {PowerState.QUICK_STOP}
-    # setpoints that go on coming move nothing
+    # further setpoints cause no motion
     last = run.go(1.0, mode, 8.0, 200.0)
     assert last.state is run.bench.ends
     assert run.rests(last)
@@ -181,7 +181,7 @@ def test_a_quick_stop_is_not_ended_by_itself(run):
     Command(Mode.SPEED, math.nan, 0.0), Command(Mode.SPEED, 0.0, math.nan), Command(Mode.SPEED, math.inf, 0.0),
     Command(Mode.TORQUE, 0.0, -math.inf), Command(Mode.SPEED, 1e300, 0.0), Command(Mode.TORQUE, 0.0, 1e9),
 ])
-def test_what_is_no_setpoint_never_reaches_the_bus(run, command):
+def test_an_invalid_setpoint_never_reaches_the_bus(run, command):
     run.ready()
     run.enable()
     frames, counters, now_s = len(run.bench.frames), run.drive.counters, run.drive.clock.now_s()
@@ -191,7 +191,7 @@ def test_what_is_no_setpoint_never_reaches_the_bus(run, command):
     assert run.cycle(speed=1.0).time_s == pytest.approx(now_s + run.drive.period_s)
 
 
-def test_an_exchange_without_preflight_is_an_error_of_ours(run):
+def test_an_exchange_without_preflight_is_a_programming_error(run):
     run.drive.connect()
     frames = len(run.bench.frames)
     with pytest.raises(TdhilError):
@@ -212,7 +212,7 @@ def test_samples_are_one_period_apart(make_bench, rate_hz):
 
 
 def test_a_frozen_loop_does_not_send_what_it_had_in_hand(run):
-    """The process was frozen, or the laptop asleep, for six times the watchdog's time."""
+    """The process was frozen, or the laptop slept, for six times the watchdog time."""
     run.turning(2.0, for_s=1.0)
     frames, clock = len(run.bench.frames), run.drive.clock
     clock.wait_until(clock.now_s() + 6.0 * run.bench.limits.watchdog_s)
@@ -228,7 +228,7 @@ def test_a_frozen_loop_does_not_send_what_it_had_in_hand(run):
     cycles(1, 9.0)
     assert [(error.where, "the control loop stood still for" in error.what) for error in told] == [("host", True)]
     assert len(run.bench.frames) == frames
-    # The stop goes on: no cycle is refused for the same stall again, and the drive is not blamed for its silence.
+    # The stop continues: the same stall is raised only once, and missing replies are not attributed to the drive.
     run.drive.quick_stop()
     cycles(round(5.0 / run.drive.period_s), 0.0)
     assert len(told) <= 2
@@ -256,7 +256,7 @@ def test_counters(run):
 
 
 def test_the_frames_on_the_bus_say_what_the_samples_say(make_bench):
-    """With lags, noise and quanta, decoded by formats typed in the tests."""
+    """The signals have lags, noise and resolution. The tests decode them with their own formats."""
     run = Run(make_bench(RigParams(), seed=3))
     run.turning(4.0, for_s=4.0)
     run.go(1.0, other_mode(run), 4.0, 90.0)
@@ -285,7 +285,7 @@ def test_the_frames_on_the_bus_carry_the_setpoints(run):
 
 
 def test_the_tap_sees_every_frame_in_order(run):
-    """What a second station on the bus hears, the driver's own frames and the drive's, is what was tapped."""
+    """The tap records the same frames as a second station on the bus: those of the driver and of the drive."""
     run.bench.heard()
     run.turning(1.0)
     run.drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
@@ -301,7 +301,7 @@ def test_the_tap_sees_every_frame_in_order(run):
     theirs = [(frame.identifier, frame.data) for frame in run.bench.frames if not frame.outgoing]
     ids = {identifier for identifier, _ in ours}
     assert [frame for frame in heard if frame[0] in ids] == ours
-    # The drive may have said more since the last exchange.
+    # The drive may have sent more since the last exchange.
     others = [frame for frame in heard if frame[0] not in ids]
     assert theirs == others[: len(theirs)]
     assert len(others) - len(theirs) <= 2
@@ -309,7 +309,7 @@ def test_the_tap_sees_every_frame_in_order(run):
 
 def test_nothing_is_sent_behind_the_loops_back(run):
     run.turning(1.0, for_s=2.0)
-    for _ in range(20):                # what the drive has yet to say to the last cycle
+    for _ in range(20):                # frames of the drive that are still due for the last cycle
         time.sleep(0.1)
         if not run.bench.heard():
             break
@@ -332,12 +332,12 @@ def test_a_drive_that_may_still_turn_keeps_its_watchdog(run):
     run.turning(2.0, for_s=2.0)
     armed = run.bench.settings((run.bench.WATCHDOG,))
     left = run.drive.close()
-    assert left and all("was not restored" in line for line in left)       # each setting that stays is named
+    assert left and all("was not restored" in line for line in left)       # each remaining setting is named
     assert run.bench.settings((run.bench.WATCHDOG,)) == armed
     assert set(armed.values()) != {0}
 
 
-def test_mapping_and_mode_are_given_back_too(run):
+def test_mapping_and_mode_are_restored_too(run):
     others = run.bench.MAPPING + run.bench.TARGETS
     before = mapped(run.bench.settings(others))
     run.ready()
@@ -347,7 +347,7 @@ def test_mapping_and_mode_are_given_back_too(run):
 
 
 def mapped(settings):
-    """Without the mapping entries beyond a PDO's count, which say nothing."""
+    """Return the settings without mapping entries beyond the count of a PDO, which have no effect."""
     def counts(key):
         index, sub = key.split(":")
         is_mapping = 0x1600 <= int(index[:4], 16) < 0x1800 or 0x1A00 <= int(index[:4], 16) < 0x1C00

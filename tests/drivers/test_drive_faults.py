@@ -1,4 +1,4 @@
-"""What goes wrong in mid-run, on the embedded simulator in stepped time and on a scripted drive in fake time."""
+"""Faults during a run, on the embedded simulator in stepped time and on a scripted drive in fake time."""
 
 import contextlib
 import itertools
@@ -18,14 +18,14 @@ PERIOD_S = 0.004
 
 @pytest.fixture
 def turning(bench):
-    """The shaft turns at about 2 rad/s."""
+    """Turn the shaft at about 2 rad/s."""
     run = Run(bench)
     run.turning(2.0, 2.0)
     return run
 
 
 def first_error(run, cycles, **setpoint):
-    """The error, and in which cycle it came; those after it must not come again."""
+    """Return the first error and its cycle. It must not be raised again."""
     for k in range(cycles):
         try:
             run.cycle(speed=2.0)
@@ -52,7 +52,7 @@ def test_the_drives_heartbeat_is_lost(turning, bench):
     ((0x701, b"\x7f"), CommunicationLost, "pre-operational"),
     ((0x701, b"\x04"), CommunicationLost, "stopped"),
 ])
-def test_what_the_drive_says_unasked_is_raised_once(turning, bench, frame, kind, text):
+def test_an_unsolicited_message_of_the_drive_is_raised_once(turning, bench, frame, kind, text):
     bench.bus.put(*frame)
     error, k = first_error(turning, 3)
     assert isinstance(error, kind)
@@ -61,17 +61,17 @@ def test_what_the_drive_says_unasked_is_raised_once(turning, bench, frame, kind,
 
 
 def test_a_third_party_puts_the_drive_into_pre_operational(turning, bench):
-    """By a command that this host does not hear (a gateway's)."""
+    """The host does not receive the command, which comes through a gateway."""
     bench.simulated.simulator.node.on_frame(0x000, bytes([0x80, 0x01]))
     with pytest.raises(CommunicationLost, match="pre-operational"):
-        for _ in range(3):                                # the frames stop at once; the heartbeat tells why
+        for _ in range(3):                                # the frames stop at once; the heartbeat shows the reason
             turning.cycle(speed=2.0)
             bench.bus.put(0x701, b"\x7f")
     assert turning.drive.counters.missed >= 1
 
 
 def test_a_third_party_resets_the_drive(turning, bench):
-    """It comes up again, and is neither operational nor enabled by us."""
+    """It restarts and is neither operational nor enabled by the host."""
     bench.foreign(0x000, bytes([0x81, 0x01]))
     with pytest.raises(DriveFault, match="boot-up"):
         turning.cycle(speed=2.0)
@@ -83,7 +83,7 @@ def test_a_third_party_resets_the_drive(turning, bench):
 
 
 def test_the_drives_own_fault_is_shown(turning, bench):
-    """A short RPDO of a third party: EMCY 8210h."""
+    """A short RPDO of another node causes EMCY 8210h."""
     bench.foreign(0x201, b"\x0f\x00")
     error, _ = first_error(turning, 3)
     assert "8210h" in error.what
@@ -118,7 +118,7 @@ def test_the_bus_fails_in_mid_cycle(turning, bench, way):
 
 
 def test_an_adapter_that_only_sends_still_gets_the_quick_stop_out(turning, bench):
-    """Each cycle of the stop waits for its tick and sends; then it reports that nothing is received."""
+    """Each cycle of the stop waits for its tick, sends, and then reports that nothing is received."""
     words, begun_s, send = [], turning.drive.clock.now_s(), bench.bus.send
 
     def sends(message):
@@ -141,7 +141,7 @@ def test_closing_on_a_dead_bus_does_not_raise(turning, bench):
     turning.drive.close()
 
 
-# -- on a scripted drive: each TPDO bears the number of its SYNC -------------------------------------------
+# -- on a scripted drive: each TPDO contains the number of its SYNC -------------------------------------------
 
 
 @pytest.fixture(params=["stepped", "real time"])
@@ -167,7 +167,7 @@ def exchange(drive, count, speed=1.0):
 
 
 def numbers(samples):
-    """Which SYNC each sample belongs to; None where there was none."""
+    """Return the SYNC number of each sample; None without a sample."""
     return [round(sample.torque_nm) if sample.fresh else None for sample in samples]
 
 
@@ -176,8 +176,8 @@ def test_each_sample_is_of_its_own_sync(numbered):
     assert numbered.counters.late == numbered.counters.missed == numbered.counters.overruns == 0
 
 
-def test_a_late_tpdo_is_counted_and_not_taken_for_the_next(in_real_time, peer):
-    """It comes after its cycle has given up, and before the next SYNC."""
+def test_a_late_tpdo_is_counted_and_not_assigned_to_the_next_cycle(in_real_time, peer):
+    """It arrives after the time-out of its cycle and before the next SYNC."""
     late_s = 0.9 * PERIOD_S
     peer.answer_sync = lambda cycle: [(late_s if cycle == 15 else 0.0002, peer.tpdo(cycle))]
     assert numbers(exchange(in_real_time, 10)) == [11, 12, 13, 14, None, 16, 17, 18, 19, 20]
@@ -186,14 +186,14 @@ def test_a_late_tpdo_is_counted_and_not_taken_for_the_next(in_real_time, peer):
 
 @pytest.mark.parametrize("late_s", [0.06, 0.6, 3.0])
 def test_in_stepped_time_nothing_is_late(stepped_drive, peer, late_s):
-    """However long a busy computer takes: the run is the same."""
+    """A busy computer may take any time: the run is the same."""
     peer.answer_sync = lambda cycle: [(late_s if cycle % 5 == 0 else 0.0002, peer.tpdo(cycle))]
     assert numbers(exchange(stepped_drive, 20)) == list(range(1, 21))
     assert (stepped_drive.counters.late, stepped_drive.counters.missed) == (0, 0)
 
 
 def answered_questions(wire, send, after_s):
-    """What was lost is known when the peer answers a question that was put behind it (6FEh, 03h and a number)."""
+    """A lost frame is known once the peer answers a later request (6FEh, 03h and a number)."""
     def on_send(identifier, data):
         if identifier == 0x6FE:
             assert data[:1] == b"\x03"
@@ -205,7 +205,7 @@ def answered_questions(wire, send, after_s):
 
 @pytest.mark.parametrize("slow_s", [0.0, 0.04, 0.4, 3.0])
 def test_in_stepped_time_what_is_lost_is_lost_on_any_computer(stepped_drive, peer, wire, slow_s):
-    """Answers take so long; one in five never comes. Nothing but what the peer says decides."""
+    """Replies are slow, and one in five is lost. Only the replies of the peer determine the result."""
     wire.on_send = answered_questions(wire, wire.on_send, slow_s)
     peer.answer_sync = lambda cycle: [] if cycle % 5 == 0 else [(slow_s, peer.tpdo(cycle))]
     assert numbers(exchange(stepped_drive, 20)) == [None if k % 5 == 0 else k for k in range(1, 21)]
@@ -213,7 +213,7 @@ def test_in_stepped_time_what_is_lost_is_lost_on_any_computer(stepped_drive, pee
 
 
 def test_an_answer_to_an_older_question_ends_no_cycle(stepped_drive, peer, wire):
-    """The TPDO came after all, and the answer behind it: it belongs to a cycle that is over."""
+    """The TPDO arrives, and then the reply to a request of an earlier cycle."""
     wire.on_send = answered_questions(wire, wire.on_send, 0.3)
     peer.answer_sync = lambda cycle: [(0.2 if cycle == 5 else 0.0002 if cycle < 6 else 0.15, peer.tpdo(cycle))]
     assert numbers(exchange(stepped_drive, 10)) == list(range(1, 11))
@@ -234,7 +234,7 @@ def test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on(stepped_drive, pe
     assert numbers(exchange(stepped_drive, 3)) == [6, 7, 8]
 
 
-def test_questions_are_no_part_of_the_log(wire, peer, profile, fake_time):
+def test_sync_requests_to_the_simulator_are_not_in_the_log(wire, peer, profile, fake_time):
     frames = []
     drive = prepared(wire, profile, tap=frames.append)
     wire.on_send = answered_questions(wire, wire.on_send, 0.01)
@@ -244,14 +244,14 @@ def test_questions_are_no_part_of_the_log(wire, peer, profile, fake_time):
     assert not [frame for frame in frames if frame.identifier == 0x6FE]
 
 
-def test_a_real_drive_is_asked_nothing(in_real_time, peer, wire):
+def test_a_real_drive_receives_no_simulator_requests(in_real_time, peer, wire):
     peer.answer_sync = lambda cycle: []
     with contextlib.suppress(CommunicationLost):
         exchange(in_real_time, 300)
     assert wire.of(0x6FE) == []
 
 
-def test_a_duplicate_is_counted_and_not_taken_for_the_next(numbered, peer):
+def test_a_duplicate_is_counted_and_not_assigned_to_the_next_cycle(numbered, peer):
     def twice(cycle):
         return [(0.0002, peer.tpdo(cycle))] + [(0.0004, peer.tpdo(cycle))] * (cycle == 5)
 
@@ -269,7 +269,7 @@ def test_a_tpdo_of_another_length_is_no_feedback(numbered, peer, data):
     assert (numbered.counters.late, numbered.counters.missed) == (0, 1)
 
 
-def test_rubbish_before_the_right_one(numbered, peer):
+def test_invalid_frames_before_the_right_one(numbered, peer):
     peer.answer_sync = lambda cycle: [(0.0001, b"\1\2\3"), (0.0002, peer.tpdo(cycle))]
     assert numbers(exchange(numbered, 7)) == list(range(1, 8))
 
@@ -321,8 +321,8 @@ def test_a_silent_drive_costs_less_than_a_cycle_each(in_real_time, peer, fake_ti
 
 
 @pytest.mark.parametrize("after", [0x77F, 0x201])
-def test_frozen_between_two_frames_of_a_cycle_it_does_not_go_on(in_real_time, peer, wire, fake_time, after):
-    """After its heartbeat no setpoint goes out, and after the setpoint no SYNC that would make it act."""
+def test_frozen_between_two_frames_of_a_cycle_it_sends_no_more_of_them(in_real_time, peer, wire, fake_time, after):
+    """It sends no setpoint after its heartbeat, and no SYNC after the setpoint, which would activate it."""
     exchange(in_real_time, 30)
     send, sent = wire.on_send, []
 
@@ -359,7 +359,7 @@ def test_the_host_heartbeat_keeps_the_watchdog_fed(in_real_time, wire, fake_time
     assert len(beats) >= 20
 
 
-def test_feedback_as_it_stood_on_the_wire(numbered, peer):
+def test_feedback_as_on_the_wire(numbered, peer):
     # 6041h = 1237h enabled, 6077h = -3 ‰ of 1000 N·m, 606Ch = -30 · 0.1 rpm
     peer.answer_sync = lambda cycle: [(0.0002, bytes.fromhex("3712fdffe2ffffff"))]
     sample = exchange(numbered, 1)[-1]
@@ -373,14 +373,14 @@ def test_feedback_as_it_stood_on_the_wire(numbered, peer):
     (0x0A37, True, False), (0x0607, False, True), (0x0207, False, False), (0x0637, False, False),
 ])
 def test_status_bits(numbered, peer, status, limited, standstill):
-    """Internal limit is bit 11; in quick stop active bit 10 says that it has come to rest."""
+    """Bit 11 is the internal limit. In quick stop active, bit 10 shows standstill."""
     peer.answer_sync = lambda cycle: [(0.0002, status.to_bytes(2, "little") + bytes(6))]
     sample = exchange(numbered, 1)[-1]
     assert (sample.limit_active, sample.standstill) == (limited, standstill)
 
 
 def test_speed_zero_counts_in_profile_velocity_only(wire, peer, profile):
-    """Bit 12 means something else in the cyclic modes."""
+    """Bit 12 has another meaning in the cyclic modes."""
     for supported, standstill in ((1 << 2, True), (1 << 8, False)):
         peer.objects[0x6502, 0] = supported.to_bytes(4, "little")
         drive = prepared(wire, profile)

@@ -1,4 +1,4 @@
-"""A simulated drive that sends an object without an end: told by name before motion, and of no weight in motion."""
+"""Simulated drive that sends an object without an end: reported before motion, and without effect in motion."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from tests.drivers.drive_benches import Run
 
 
 class EndlessUploads:
-    """Turn each answer to an upload into segments of one byte that never end; segments of the drive stay with it."""
+    """Bus that turns each reply to an upload into endless segments of one byte."""
 
     def __init__(self, bus):
         self.segments = self.aborts = 0

@@ -1,4 +1,4 @@
-"""What is particular to EtherCAT: working counter, AL states, watchdog registers, PDOs, clocks, the raw datagrams."""
+"""Particulars of EtherCAT: working counter, AL states, watchdog registers, PDOs, clocks, raw datagrams."""
 
 import errno
 import socket
@@ -76,7 +76,7 @@ def test_a_slave_that_vanishes_is_reported(turning):
     error = error_of(turning)
     assert (error.entry, "working counter" in error.what) == (MessageCode.FEEDBACK_LOST, True)
     turning.drive.quick_stop()
-    assert turning.drive.poll() is None                         # it raises nothing: a stop goes on
+    assert turning.drive.poll() is None                         # it raises nothing, so that a stop continues
 
 
 @pytest.mark.parametrize(("state", "code", "entry", "said"), [
@@ -84,7 +84,7 @@ def test_a_slave_that_vanishes_is_reported(turning):
     (4, 0x001B, MessageCode.WATCHDOG_ACTED, "AL status code 001Bh (sync manager watchdog)"),
     (2, 0x9999, MessageCode.STATE_LEFT, "PRE-OP, AL status code 9999h (see the manual of the drive)"),
 ])
-def test_an_al_error_is_told_with_its_code(turning, state, code, entry, said):
+def test_an_al_error_is_reported_with_its_code(turning, state, code, entry, said):
     turning.bench.slave.fall(state, code)
     error = error_of(turning)
     assert error.entry is entry
@@ -109,14 +109,14 @@ def test_an_emergency_about_an_al_state_adds_nothing(turning):
     turning.go(0.3, speed=1.0)
 
 
-def test_each_error_is_raised_once_and_the_stop_goes_on(turning):
+def test_each_error_is_raised_once_and_the_stop_continues(turning):
     turning.bench.slave.emergency(0x4310)
     error_of(turning)
     turning.stop()
 
 
 def test_outside_of_op_the_drive_is_stopped_and_disabled_by_sdo(turning):
-    """It takes no setpoints there, though the working counter is right."""
+    """It accepts no setpoints there, although the working counter is right."""
     turning.bench.slave.fall(4, 0x001A)
     error_of(turning)
     turning.stop()
@@ -163,7 +163,7 @@ def test_after_stop_feeding_no_setpoint_is_sent_but_feedback_comes(turning, monk
     assert turning.go(0.1, speed=1.0).fresh
     turning.drive.poll()
     assert [identifier for identifier, _ in turning.bench.heard() if identifier in (2, 3)] == []
-    assert turning.bench.slave.drive.data[0x5FFE, 2] == b"\0"    # the simulated drive goes on in its own time
+    assert turning.bench.slave.drive.data[0x5FFE, 2] == b"\0"    # the simulated drive continues in its own time
     turning.drive.quick_stop()
     turning.bench.slave.fall(4, 0x001B)
     assert error_of(turning).entry is MessageCode.WATCHDOG_ACTED
@@ -193,7 +193,7 @@ def test_after_stop_feeding_the_torque_is_removed_at_any_speed(turning, monkeypa
 def test_a_poll_never_enables_again(turning):
     turning.drive.poll()
     assert turning.drive._bus._setpoints.word == 0x0002
-    assert turning.bench.slave.application.controlword == 0x000F         # nothing was sent by it in stepped time
+    assert turning.bench.slave.application.controlword == 0x000F         # it sends nothing in stepped time
 
 
 def test_a_quick_stop_that_is_not_executed_stays_in_the_process_data(turning):
@@ -239,7 +239,7 @@ def test_the_interface_is_closed_once(bench):
     assert closed == [True]
 
 
-def test_a_refused_state_is_told_with_its_code(bench, monkeypatch):
+def test_a_refused_state_is_reported_with_its_code(bench, monkeypatch):
     write = bench.slave._fpwr
 
     def refuses(address, data, timeout_us=2000):
@@ -298,7 +298,7 @@ def test_an_error_that_is_not_cleared_ends_the_wait(bench, monkeypatch):
 
 
 def with_fixed_pdos(bench, rx, tx):
-    """Let the slave have PDOs of its own content, and the profile name them."""
+    """Give the slave PDOs with a fixed content, and name them in the profile."""
     for base, pdos in ((0x1600, rx), (0x1A00, tx)):
         for number, entries in enumerate(pdos):
             bench.slave.objects(base + number, 4, entries)
@@ -347,7 +347,7 @@ def test_another_rate_is_set_in_pre_op(bench):
 
 
 class DriftingClock(SteppedClock):
-    """Control time that is no stepped time, for a loop that is never late."""
+    """Control time with drift for a loop that is never late. It is not stepped."""
 
     stepped = False
 
@@ -442,10 +442,10 @@ def test_a_drive_that_keeps_torque_mode_is_taken_out_of_op_too(turning, name):
     assert any("6060h" in line for line in report.remarks) is (name == "maxon/epos4-ethercat")
 
 
-def test_a_scan_reads_what_a_slave_says_of_itself(bench):
+def test_a_scan_reads_the_identity_of_a_slave(bench):
     found = found_slave(0, bench.segment.station)
     assert (found.identity, found.title, found.simulated) == ((4, 4, 3, 4), "objects behind a mailbox", True)
-    assert found_slave(0, bench.segment.station, driven=True).device_type is None      # its mailbox is its master's
+    assert found_slave(0, bench.segment.station, driven=True).device_type is None      # its master has its mailbox
     bench.slave.number(0x0130, 1)
     assert found_slave(0, bench.segment.station).device_type is None
 
@@ -454,7 +454,7 @@ def test_a_scan_reads_what_a_slave_says_of_itself(bench):
 
 
 class Wire:
-    """A socket on which one slave answers, or nothing does."""
+    """Socket on which one slave or no slave replies."""
 
     def __init__(self, status=8, answers=True):
         self.status, self.answers, self.came = status, answers, []
@@ -471,7 +471,7 @@ class Wire:
             if frame[16] != 2:
                 back[26 : 26 + size] = self.status.to_bytes(2, "little").ljust(size, b"\0")
             back[26 + size] = 1
-            self.came += [bytes(60), bytes(back)]                # another master's frame comes first
+            self.came += [bytes(60), bytes(back)]                # a frame of another master comes first
 
     def settimeout(self, seconds):
         pass

@@ -1,4 +1,4 @@
-"""A drive that leaves operation by itself is not enabled again by itself, whichever way it left."""
+"""Drive that leaves operation without a command: it is not enabled again without a request."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def drive(wire, peer, profile):
 @pytest.mark.parametrize(("state", "shown"), [
     (OFF, PowerState.OFF), (READY, PowerState.OFF), (FAULT, PowerState.FAULT),
 ])
-def test_it_stays_out(drive, wire, peer, state, shown):
+def test_it_stays_out_of_operation(drive, wire, peer, state, shown):
     peer.machine.state = state
     assert cycles(drive, wire).state is shown
     begin = len(peer.setpoints)
@@ -27,7 +27,7 @@ def test_it_stays_out(drive, wire, peer, state, shown):
     assert all(word & 0x0F != 0x0F for word, _, _ in peer.setpoints[begin:])
 
 
-def test_it_comes_back_when_asked_in_again(drive, wire, peer):
+def test_it_returns_to_operation_on_request(drive, wire, peer):
     peer.machine.state = OFF
     assert cycles(drive, wire).state is PowerState.OFF
     drive.enable(Mode.SPEED)
@@ -36,7 +36,7 @@ def test_it_comes_back_when_asked_in_again(drive, wire, peer):
 
 
 def test_one_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog(drive, wire, peer):
-    """A statusword of zero, whoever made it one, is no proof that the drive is off."""
+    """A statusword of zero from any cause is no proof that the drive is disabled."""
     armed = peer.value(0x1016, 1)
     peer.tpdo = lambda cycle: TPDO1.pack(0, 0, 50_000)
     assert cycles(drive, wire).state is PowerState.UNKNOWN
@@ -46,16 +46,16 @@ def test_one_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog(drive, 
     assert len(peer.writes) == written
 
 
-# -- who controls it ---------------------------------------------------------------------------------------------------
+# -- control place -----------------------------------------------------------------------------------------------------
 
 
 def test_a_drive_that_is_switched_to_another_control_place_ends_the_run(drive, wire, peer):
-    """Bit 9 of the statusword, which was set in operation."""
+    """The test clears bit 9 of the statusword, which was set in operation."""
     peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0)
     with pytest.raises(CommunicationLost, match=r"bit 9 \(remote\) of the statusword 1037h is 0"):
         cycles(drive, wire, 5)
     drive.quick_stop()
-    cycles(drive, wire, 20)            # told once
+    cycles(drive, wire, 20)            # reported once
 
 
 def test_a_drive_that_never_sets_that_bit_is_not_judged_by_it(wire, peer, profile):
@@ -71,7 +71,7 @@ def test_one_frame_without_it_is_an_accident(drive, wire, peer):
 
 @pytest.mark.parametrize("target", [0, 1])
 def test_pre_operational_and_start_in_quick_succession_are_noticed(drive, wire, target):
-    """No heartbeat shows it: the drive is operational again when the next one comes."""
+    """The heartbeat does not show it, since the drive is operational again at the next one."""
     wire.put(0x000, bytes((0x80, target)))
     wire.put(0x000, bytes((0x01, target)))
     with pytest.raises(CommunicationLost, match="another master put the drive into NMT state pre-operational"):

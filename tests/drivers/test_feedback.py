@@ -1,4 +1,4 @@
-"""One TPDO1 for a SYNC: which is taken, which are doubted, and which can't be the drive's."""
+"""One TPDO1 per SYNC: frames that are used, frames in doubt, and frames that cannot be from the drive."""
 
 import pytest
 from hypothesis import given
@@ -12,7 +12,7 @@ WIDE = FrameShape(torque=(0x2000, 0, 32))
 
 
 def cycles(*frames, feedback=None):
-    """What was taken of each cycle, None for nothing; and the feedback."""
+    """Return the value used in each cycle, or None, and the feedback object."""
     feedback = feedback or PdoFeedback(STANDARD)
     taken = []
     for cycle in frames:
@@ -29,7 +29,7 @@ def test_the_first_of_a_cycle_is_taken_and_the_next_begins_with_none():
     assert feedback.arrived == 3
 
 
-def test_doubt_is_told_once():
+def test_doubt_is_reported_once():
     _, feedback = cycles([NEW], [OLD, NEW])
     assert feedback.doubted()
     assert not feedback.doubted()
@@ -45,12 +45,12 @@ def test_one_that_comes_after_its_cycle_is_doubted_in_the_next():
 
 
 @pytest.mark.parametrize(("frames", "contradictions"), [
-    ([[NEW, NEW]], 0),                          # doubled on its way
+    ([[NEW, NEW]], 0),                          # duplicated on the way
     ([[NEW, OLD]], 1),
     ([[NEW, OLD, OTHER]], 2),
     ([[NEW], [], [OTHER, NEW]], 0),             # the one that was missing came late
     ([[NEW], [], [OTHER, NEW, NEW], [NEW, OLD]], 2),
-    ([[], [], [], [], [NEW, OLD, OLD, OLD, OLD]], 0),      # the answers of five SYNCs
+    ([[], [], [], [], [NEW, OLD, OLD, OLD, OLD]], 0),      # the replies to five SYNCs
     ([[], [], [], [], [NEW, OLD, OLD, OLD, OLD, OTHER]], 1),
     ([[]] * 60 + [[OLD] * 60 + [NEW]], 0),
     ([[]] * 60 + [[OLD] * 60 + [NEW, OTHER]], 1),
@@ -60,7 +60,7 @@ def test_contradictions(frames, contradictions):
     assert feedback.contradictions == contradictions
 
 
-def test_the_drive_answers_somebody_elses_sync_too():
+def test_the_drive_also_replies_to_a_foreign_sync():
     feedback = PdoFeedback(STANDARD)
     for _ in range(10):
         feedback.begin()
@@ -84,7 +84,7 @@ def test_a_drive_alone_is_never_doubted_and_more_than_one_always(frames):
 
 @given(st.lists(st.sampled_from(["in time", "lost", "late"]), max_size=30))
 def test_a_slow_drive_contradicts_nothing(fates):
-    """Answers that are lost, or come within the next cycle, before that one's own."""
+    """Replies are lost, or arrive in the next cycle before the reply of that cycle."""
     feedback, late = PdoFeedback(STANDARD), None
     for number, fate in enumerate(fates):
         feedback.begin()
@@ -115,10 +115,10 @@ def test_halves_of_one_sync_are_joined_in_either_order():
         assert feedback.data == b"\x27\x02" + NEW[:WIDE.data_size()]
         feedback.begin()
         feedback.on_status(b"\x27\x02")
-        assert not feedback.data, "a half of the last cycle must not complete this one"
+        assert not feedback.data, "a half from the last cycle must not complete this one"
 
 
-def test_while_a_peer_tells_where_cycles_end_they_are_waited_for():
+def test_the_end_of_a_cycle_is_waited_for_while_a_peer_marks_it():
     feedback = PdoFeedback(STANDARD)
     feedback.begin()
     feedback.on_cycle_end(CYCLES_END)
@@ -135,15 +135,15 @@ def test_while_a_peer_tells_where_cycles_end_they_are_waited_for():
     assert feedback.done
 
 
-# -- in real time: answers may come after their cycle, and belong to SYNCs in their order --------------------------
+# -- in real time: replies may arrive after their cycle, in the order of their SYNCs --------------------------
 
 PERIOD_S, ANSWER_S = 0.004, 0.0003
 
 
 class Wire:
-    """Cycles in real time: each SYNC bears its number, and its answer arrives when ``fates`` say (None: lost).
+    """Cycles in real time: each SYNC has a number, and its reply arrives at the time in ``fates`` (None: lost).
 
-    `given`: the number that was taken of each cycle, None where none was.
+    `given`: the number that was used in each cycle, or None.
     """
 
     def __init__(self):
@@ -156,7 +156,7 @@ class Wire:
     def cycle(self, answer_s=ANSWER_S, foreign=()):
         number, begun_s = len(self.given), self.now_s
         if answer_s is not None:
-            self._last_s = max(self._last_s, begun_s + answer_s)       # a queue keeps its order
+            self._last_s = max(self._last_s, begun_s + answer_s)       # the order of the queue is kept
             self._coming.append((self._last_s, number.to_bytes(8, "little")))
         self._coming += [(begun_s + after_s, data) for after_s, data in foreign]
         self._coming.sort(key=lambda entry: entry[0])
@@ -177,13 +177,13 @@ class Wire:
 
 
 def held_back(wire, cycles):
-    """An adapter that hands nothing on for so many cycles, and then everything at once, in order."""
+    """Return the times of an adapter that holds all frames for some cycles and then delivers them at once, in order."""
     for number in range(cycles):
         wire.cycle((cycles - number) * PERIOD_S + ANSWER_S)
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 5, 30, 60])
-def test_a_burst_after_a_late_adapter_is_given_to_its_syncs(cycles):
+def test_a_burst_after_a_late_adapter_is_assigned_to_its_syncs(cycles):
     wire = Wire()
     for _ in range(5):
         wire.cycle()
@@ -197,7 +197,7 @@ def test_a_burst_after_a_late_adapter_is_given_to_its_syncs(cycles):
 
 
 @pytest.mark.parametrize("lost", [1, 2, 30])
-def test_after_answers_that_were_lost_one_more_cycle_is_doubtful(lost):
+def test_after_lost_replies_one_more_cycle_is_doubtful(lost):
     wire = Wire()
     for fate in [ANSWER_S] * 5 + [None] * lost + [ANSWER_S] * 5:
         wire.cycle(fate)
@@ -206,7 +206,7 @@ def test_after_answers_that_were_lost_one_more_cycle_is_doubtful(lost):
 
 
 def test_a_drive_that_is_always_a_cycle_late_is_never_paired_with_the_wrong_sync():
-    """How soon it answers is known from the first SYNC, which is given its time (`CanopenDrive`)."""
+    """The reply time is known from the first SYNC, which has a longer time-out (`CanopenDrive`)."""
     wire = Wire()
     wire.feedback.begin(0.0)
     wire.now_s = 1.2 * PERIOD_S
@@ -220,7 +220,7 @@ def test_a_drive_that_is_always_a_cycle_late_is_never_paired_with_the_wrong_sync
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.floats(0.0, 12.0)), max_size=12), st.floats(0.05, 0.7))
 def test_a_late_answer_is_never_another_syncs(holds, answer):
-    """Whatever holds answers back hands them on together: (cycles in time, how many more are held) again and again."""
+    """Held replies arrive together: repeated pairs of (cycles in time, number of held cycles)."""
     wire, until_s = Wire(), 0.0
     for in_time, held in [(3, 0.0), *holds]:
         for _ in range(in_time):
@@ -234,7 +234,7 @@ def test_a_late_answer_is_never_another_syncs(holds, answer):
 
 
 @given(st.lists(st.sampled_from([ANSWER_S, 0.001, 0.0012, None]), max_size=120))
-def test_whatever_is_lost_no_sample_is_another_syncs(fates):
+def test_with_any_losses_no_sample_is_assigned_to_another_sync(fates):
     wire = Wire()
     for fate in [0.001] * 3 + fates:
         wire.cycle(fate)
@@ -252,7 +252,7 @@ def test_somebody_who_sends_too_is_found_however_late_the_host_was():
     assert wire.feedback.contradictions >= 3
 
 
-def test_where_no_sync_went_out_no_answer_is_owed():
+def test_without_a_sync_no_reply_is_expected():
     wire = Wire()
     for _ in range(3):
         wire.cycle()

@@ -34,7 +34,7 @@ def test_a_cut_off_frequency():
 @pytest.mark.parametrize(("kind", "data"), [
     ("i16", b"\xff\xff"), ("f32", struct.pack("<f", math.nan)), ("f32", struct.pack("<f", math.inf)), ("u32", b"\1\0"),
 ])
-def test_what_is_no_filter_setting(kind, data):
+def test_invalid_filter_settings(kind, data):
     with pytest.raises(ObjectRefused) as caught:
         lag_seconds(entry(kind=kind), data)
     assert caught.value.where == "2504h"

@@ -1,4 +1,4 @@
-"""A bus with more frames than the computer can read: the quick stop is sent all the same, and at once."""
+"""Bus with more frames than the computer can read: the quick stop is still sent at once."""
 
 from contextlib import suppress
 
@@ -20,7 +20,7 @@ QUICK_STOP = bytes.fromhex("2b40600002000000")
 
 
 def flood(wire):
-    """Let each read return a frame of a babbling node. Answers are behind them."""
+    """Let each read return a frame of a babbling node, before any reply of the drive."""
 
     def recv(timeout=0.0):
         wire.time.sleep(READ_S)

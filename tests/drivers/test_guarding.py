@@ -1,4 +1,4 @@
-"""Node guarding: the toggle by itself, then a drive that is watched by it, whose host falls silent or is lied to."""
+"""Node guarding: the toggle alone, then a guarded drive with a silent host or with false replies."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ ANSWER = 0x701
 
 
 class Guarded:
-    """The pure part, with the questions counted."""
+    """Guarding without a bus, with a count of the requests."""
 
     def __init__(self):
         self.clock = SteppedClock()
@@ -53,7 +53,7 @@ def test_an_answer_counts_where_its_toggle_is_new(answers):
     assert one.guarding.answers == changes
 
 
-def test_answers_that_do_not_toggle_are_none():
+def test_replies_that_do_not_toggle_do_not_count():
     one = Guarded()
     for _ in range(4):
         one.guarding.on_frame(b"\x05")
@@ -74,7 +74,7 @@ def test_no_answers():
 @pytest.mark.parametrize(("byte", "kind", "text"), [
     (0x84, CommunicationLost, "stopped"), (0xFF, CommunicationLost, "pre-operational"), (0x00, DriveFault, "restarted"),
 ])
-def test_the_state_in_an_answer_is_looked_at(byte, kind, text):
+def test_the_state_in_a_reply_is_checked(byte, kind, text):
     one = Guarded()
     one.guarding.on_frame(b"\x05")
     one.guarding.on_frame(bytes([byte]))
@@ -82,7 +82,7 @@ def test_the_state_in_an_answer_is_looked_at(byte, kind, text):
         one.watch.check()
 
 
-def test_an_empty_frame_is_no_answer():
+def test_an_empty_frame_is_no_reply():
     one = Guarded()
     one.guarding.on_frame(b"")
     assert one.guarding.answers == 0
@@ -100,7 +100,7 @@ def row(found, title):
     return next(check for check in found.checks if check.name == title)
 
 
-def test_the_drive_is_asked_often_enough_and_answers(run):
+def test_the_drive_is_guarded_often_enough_and_replies(run):
     found = run.ready()
     assert row(found, "watchdog").found == "125 ms x 4, answered"
     assert found.safe_action == "quick_stop"
@@ -114,27 +114,27 @@ def test_the_drive_is_asked_often_enough_and_answers(run):
     assert max(later - sooner for sooner, later in pairwise(asked)) <= 0.125
     assert len(answers) == len(asked)
     assert all(a ^ b == 0x80 and a & 0x7F == 0x05 for a, b in pairwise(answers))
-    assert not [frame for frame in frames if frame.identifier == 0x77F], "no heartbeat of the host beside it"
+    assert not [frame for frame in frames if frame.identifier == 0x77F], "the host also sends a heartbeat"
 
 
 def test_a_silent_host_is_noticed_by_the_drive_and_the_shaft_stops(run):
     run.turning(5.0)
     speeds = []
-    for _ in range(700):                                   # somebody else's SYNC lets the time go by, 10 ms each
+    for _ in range(700):                                   # foreign SYNCs advance the time by 10 ms each
         run.bench.foreign(0x080, b"")
         run.bench.heard()
         run.bench.read(0x1000)
         speeds.append(run.bench.true_speed_rad_s)
-    assert speeds[38] > 4.9                                # 125 ms x 4 after the last question
+    assert speeds[38] > 4.9                                # 125 ms x 4 after the last request
     late = next(number for number, speed in enumerate(speeds) if speed < 4.9)
     assert 0.01 * late <= 0.5 + 0.25
     still = next(number for number, speed in enumerate(speeds) if abs(speed) < 0.05)
     assert 0.01 * still <= 0.5 + 5.0 / run.bench.limits.quick_stop_rad_s2 + 0.5
     assert max(map(abs, speeds[still + 50:])) < 0.1
-    for _ in range(2):                                     # somebody else's SYNC, and what the drive says of it
+    for _ in range(2):                                     # a foreign SYNC and the drive's reply
         with pytest.raises((CommunicationLost, DriveFault)):
             run.go(1.0, speed=5.0)
-    assert run.go(0.5, speed=5.0).state is PowerState.OFF   # and it isn't enabled again by itself
+    assert run.go(0.5, speed=5.0).state is PowerState.OFF   # and it is not enabled again without a request
     assert abs(run.bench.true_speed_rad_s) < 0.1
 
 
@@ -147,14 +147,14 @@ def changed(message, data):
     (lambda message: [], "have been missing"),
     (lambda message: [changed(message, bytes([message.data[0] & 0x80 | 0x04]))], "stopped"),
 ])
-def test_lies_about_the_drive_are_noticed_within_the_life_time(run, change, text):
+def test_false_replies_are_found_within_the_life_time(run, change, text):
     run.turning(2.0)
     run.bench.bus.change = lambda message: change(message) if message.arbitration_id == ANSWER else [message]
     begin_s = run.drive.clock.now_s()
     with pytest.raises(CommunicationLost, match=text):
         run.go(2.0, speed=2.0)
     assert run.drive.clock.now_s() - begin_s <= 0.8
-    run.go(0.5, speed=2.0)                                  # once only: a stop goes on
+    run.go(0.5, speed=2.0)                                  # once only, so that a stop continues
 
 
 def test_where_remote_frames_do_not_get_through_it_is_refused(run):
@@ -176,7 +176,7 @@ def test_a_drive_without_life_guarding_is_refused(run):
 
 
 def test_the_drives_own_heartbeat_is_switched_off(run):
-    """A node that produces a heartbeat is not guarded (CiA 301): it would leave the questions unanswered."""
+    """A node that produces a heartbeat does not reply to guarding requests (CiA 301)."""
     run.bench.simulated.simulator.node.store.write(0x101700, 100)
     found = run.ready()
     assert row(found, "drive's heartbeat").found == "0 ms"

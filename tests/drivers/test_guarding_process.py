@@ -1,7 +1,7 @@
-"""Node guarding between two processes: the simulated drive behind our own socketcand hub, its host gone of a sudden.
+"""Node guarding between two processes: the simulated drive behind tdhil's socketcand hub, and a host that disappears.
 
-python-can's client sends a remote frame as a length without bytes, which our hub takes for what it is; a foreign
-socketcand server may make a data frame of it, and then preflight refuses (see test_guarding).
+python-can's client sends a remote frame as a length without bytes. The hub recognises it. A foreign
+socketcand server may convert it to a data frame. Then preflight refuses (see test_guarding).
 """
 
 import csv
@@ -40,7 +40,7 @@ def simulated(tmp_path):
 
 
 @pytest.mark.heavy
-def test_a_host_that_is_gone_leaves_a_shaft_at_rest(simulated):
+def test_after_the_end_of_the_host_the_shaft_comes_to_standstill(simulated):
     port, trace, process = simulated
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0", tcp_tune=True)
     drive = CanopenDrive(bus, load_canopen_profile(NAME), SteppedClock(), node=1)
@@ -53,7 +53,7 @@ def test_a_host_that_is_gone_leaves_a_shaft_at_rest(simulated):
         sample = drive.exchange(Command(Mode.SPEED, 5.0, 0.0))
     assert sample.state is PowerState.ENABLED
     assert sample.speed_rad_s == pytest.approx(5.0, abs=0.3)
-    bus.shutdown()                                           # no quick stop, no disable, no good-bye
+    bus.shutdown()                                           # no quick stop, no disable, no close
     deadline_s = time.monotonic() + 300.0
     rows = []
     while time.monotonic() < deadline_s:
@@ -67,5 +67,5 @@ def test_a_host_that_is_gone_leaves_a_shaft_at_rest(simulated):
     lost = next(row for row in rows if row[4:] == ["host's node guarding lost"])
     ended = next(row for row in rows if row[4:] == ["state: switch on disabled"] and float(row[0]) > float(lost[0]))
     assert float(lost[1]) == pytest.approx(5.0, abs=0.3)
-    assert float(ended[0]) - float(lost[0]) < 5.0 / 2.0 + 1.5      # the ramp that preflight has set
+    assert float(ended[0]) - float(lost[0]) < 5.0 / 2.0 + 1.5      # the ramp set by preflight
     assert abs(float(rows[-1][1])) < 0.1

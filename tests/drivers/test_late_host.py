@@ -1,6 +1,6 @@
-"""A host or an adapter that is late: not taken for somebody else on the bus, nor for a drive that fell silent.
+"""Late host or adapter: it is neither reported as another master nor as a silent drive.
 
-On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
+The tests use a scripted drive in fake time. Each TPDO1 contains the number of its SYNC.
 """
 
 from dataclasses import replace
@@ -33,19 +33,19 @@ def numbers(drive, count):
 
 @pytest.mark.parametrize("held", [2, 5, 20, 60])
 def test_an_adapter_that_hands_everything_on_at_once_is_nobody_else(drive, peer, fake_time, held):
-    """Every SYNC is answered once; but the answers of so many come together, as a stalled adapter gives them."""
+    """Every SYNC has one reply, but several replies arrive together, as from a stalled adapter."""
     release_s = fake_time.now_s + (held + 0.5) * PERIOD_S
     peer.answer_sync = lambda cycle: [(max(0.0002, release_s - fake_time.now_s), peer.tpdo(cycle))]
     peer.bus.put(0x701, b"\x05", (held + 0.4) * PERIOD_S)
     found = numbers(drive, held + 5)
-    # Each sample is of its own SYNC or there is none; and those in time are all there.
+    # Each sample belongs to its own SYNC or is missing. All samples in time are present.
     assert all(one in (None, 11 + k) for k, one in enumerate(found)), found
     assert found[-4:] == [11 + held + 1 + k for k in range(4)]
     assert drive.counters.late >= held - 1
 
 
-def test_a_loop_that_comes_back_late_finds_what_came_in_time(drive, peer, wire, fake_time):
-    """Frozen for 30 ms behind its SYNC, it reads the answer all the same, and pairs it with that SYNC."""
+def test_a_late_loop_finds_a_reply_that_was_in_time(drive, peer, wire, fake_time):
+    """A loop frozen for 30 ms after its SYNC still reads the reply, and assigns it to that SYNC."""
     send = wire.on_send
 
     def freeze(identifier, data):
@@ -61,7 +61,7 @@ def test_a_loop_that_comes_back_late_finds_what_came_in_time(drive, peer, wire, 
 
 @pytest.mark.parametrize("where", ["before the tick", "after SYNC"])
 def test_a_stall_is_told_before_what_the_drive_did_meanwhile(drive, peer, wire, fake_time, where):
-    """The drive's watchdog has acted (EMCY 8130h), its heartbeat went on: nothing of that is the drive's doing."""
+    """The watchdog of the drive has acted (EMCY 8130h) and its heartbeat continued. The drive is not the cause."""
     send = wire.on_send
 
     def asleep():
@@ -92,11 +92,11 @@ def test_a_stall_is_told_before_what_the_drive_did_meanwhile(drive, peer, wire, 
         assert error.where.startswith("host")
         assert error.next_step == LOWER_THE_RATE
     assert any("8130h" in error.what for error in told)
-    assert not any("has been missing" in error.what for error in told), "it lay unread"
+    assert not any("has been missing" in error.what for error in told), "the heartbeat was received but not yet read"
 
 
 def test_a_short_stall_is_told_before_a_heartbeat_that_is_missing(drive, peer, wire, fake_time):
-    """0.2 s are borne; but the drive's heartbeat, which stops then, is not the drive's alone to answer for."""
+    """A stall of 0.2 s is tolerated. But the message for a heartbeat that stops then names the stall too."""
     fake_time.sleep(0.2)
     with pytest.raises(CommunicationLost, match=r"still for 0\.20 s. After that: the drive's heart") as e:
         for _ in range(200):
@@ -104,8 +104,8 @@ def test_a_short_stall_is_told_before_a_heartbeat_that_is_missing(drive, peer, w
     assert e.value.next_step == LOWER_THE_RATE
 
 
-def test_a_watchdog_that_acted_on_many_late_cycles_is_told_with_them(drive, wire, fake_time):
-    """None of them is long; it is their sum that lets the drive's watchdog run out."""
+def test_a_watchdog_that_acted_on_many_late_cycles_is_reported_with_them(drive, wire, fake_time):
+    """Each delay is short, but their sum makes the watchdog of the drive expire."""
     with pytest.raises(CommunicationLost) as caught:
         for cycle in range(200):
             if cycle % 4 == 0:
@@ -120,7 +120,7 @@ def test_a_watchdog_that_acted_on_many_late_cycles_is_told_with_them(drive, wire
 
 
 def test_a_watchdog_that_acted_though_the_loop_was_in_time_is_the_hosts_or_the_buss(drive, wire):
-    """The frames were sent; whether they came through nobody here can tell, but it isn't the drive's doing."""
+    """The frames were sent. The host cannot know whether they arrived, but the drive is not the cause."""
     wire.put(0x081, bytes.fromhex("3081110000000000"))
     with pytest.raises(CommunicationLost, match=r"^host or bus, reported by node 1: the drive's watchdog has tripped"):
         for _ in range(5):
@@ -137,7 +137,7 @@ def test_a_heartbeat_that_is_missing_is_the_drives_where_the_loop_was_in_time(dr
 
 @pytest.mark.parametrize(("away_s", "refused"), [(0.2, False), (0.3, True), (0.5, True), (2.4, True)])
 def test_half_of_the_watchdogs_time_is_the_longest_stall(drive, wire, fake_time, away_s, refused):
-    """Beyond it the drive's watchdog may have acted; a setpoint from before it must not go out."""
+    """After a longer stall the watchdog may have acted. An older setpoint must not be sent then."""
     wire.put(0x701, b"\x05", away_s)
     fake_time.sleep(away_s)
     wire.sent.clear()
@@ -149,7 +149,7 @@ def test_half_of_the_watchdogs_time_is_the_longest_stall(drive, wire, fake_time,
         assert drive.exchange(TURN).fresh
 
 
-def test_how_late_is_told_in_numbers(drive, peer, wire, fake_time):
+def test_the_lateness_is_reported_in_numbers(drive, peer, wire, fake_time):
     for _ in range(20):
         wire.put(0x701, b"\x05")
         fake_time.sleep(0.01)
@@ -170,7 +170,7 @@ def test_words_for_lateness():
     assert how_late([0.0] * 950 + [0.038] * 50, PERIOD_S) == "host or adapter late (50 of 1000 cycles, p99 38 ms)"
 
 
-def test_standing_still_is_remembered_for_a_while(fake_time):
+def test_a_stall_is_remembered_for_some_time(fake_time):
     clock = MonotonicClock()
     ticks = Ticks(clock, PERIOD_S, 0.25)
     fake_time.sleep(0.2)
@@ -184,8 +184,8 @@ def test_standing_still_is_remembered_for_a_while(fake_time):
     assert ticks.stood_still_s(1.0) == 0.0
 
 
-def test_a_stall_is_told_once_and_the_beat_goes_on_from_there(fake_time):
-    """Whoever comes back stops the shaft: that must not be refused again, at once, for the same stall."""
+def test_a_stall_is_reported_once_and_the_cycles_continue_from_there(fake_time):
+    """The host stops the shaft after a stall. The stop must not be refused because of the same stall."""
     ticks = Ticks(MonotonicClock(), PERIOD_S, 0.25)
     ticks.wait()
     fake_time.sleep(3.0)
@@ -199,8 +199,8 @@ def test_a_stall_is_told_once_and_the_beat_goes_on_from_there(fake_time):
     assert ticks.overruns == 0
 
 
-def test_a_talk_that_takes_long_is_no_stall(fake_time):
-    """A reply that was waited for until after the next tick was due is told by its own error, if by any."""
+def test_a_long_exchange_is_no_stall(fake_time):
+    """A wait for a reply beyond the next tick is reported by its own error, if at all."""
     ticks = Ticks(MonotonicClock(), PERIOD_S, 0.25)
     ticks.wait()
     fake_time.sleep(1.0)
@@ -209,8 +209,8 @@ def test_a_talk_that_takes_long_is_no_stall(fake_time):
     assert ticks.stood_still_s(10.0) == 0.0
 
 
-def test_time_spent_well_is_not_overslept(fake_time):
-    """An SDO beside the cycle may take a while: no tick was missed for it."""
+def test_time_of_an_sdo_is_no_lateness(fake_time):
+    """An SDO beside the cycle may take some time. It is no missed tick."""
     ticks = Ticks(MonotonicClock(), PERIOD_S, 0.25)
     ticks.wait()
     fake_time.sleep(0.1)
@@ -242,7 +242,7 @@ def test_another_rate_is_written_before_anything_is_enabled(prepared, peer, wire
     assert all(sample.fresh for sample in samples)
     assert peer.syncs == counted + 20
     assert fake_time.now_s - begun_s == pytest.approx(20 * 0.02, abs=0.02)
-    assert len(wire.of(0x77F)) >= 3                       # the watchdog goes on being fed
+    assert len(wire.of(0x77F)) >= 3                       # feeding of the watchdog continues
     assert (prepared.counters.cycles, prepared.counters.missed) == (20, 0)
 
 
@@ -270,12 +270,12 @@ def test_a_named_rate_and_stepped_time_leave_no_choice(wire, peer, profile, fake
     assert CanopenDrive(wire, profile, SteppedClock(), node=1).rates_hz == ()
 
 
-# -- a stall, and the bus off on waking --------------------------------------------------------------------------------
+# -- a stall and bus-off afterwards ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("behind_s", [0.0, 0.001, 0.5])
-def test_a_long_stall_and_a_bus_that_is_off_on_waking(drive, peer, wire, fake_time, behind_s):
-    """25 s away, and the adapter has gone bus-off: the stall is told first, and nothing is sent from then on."""
+def test_a_long_stall_and_a_bus_that_is_off_afterwards(drive, peer, wire, fake_time, behind_s):
+    """After a stall of 25 s the adapter is bus-off. The stall is reported first, and no more frames are sent."""
     peer.silent = True
     fake_time.now_s += 25.0
     wire.put(0x040, bytes(8), behind_s, is_error_frame=True)

@@ -1,4 +1,4 @@
-"""Stages are told to a peer that bears the simulator's marker, in one request, and to nobody else."""
+"""Stages are sent in one request, and only to a peer with the simulator's marker."""
 
 import struct
 
@@ -14,7 +14,7 @@ from sim_bus.params import RigParams
 
 
 class Peer:
-    """An embedded drive; ``becomes`` is told each write to the stage register, and None is silence."""
+    """Embedded drive; ``becomes`` gets each write to the stage register. None is no reply."""
 
     def __init__(self, profile, *, becomes=lambda reply, complete_s: (reply, complete_s)):
         self.told = []
@@ -38,7 +38,7 @@ class Peer:
 @pytest.mark.parametrize(("name", "function"), [("generic/modbus", 6), ("yaskawa/ga700", 16)])
 def test_each_stage_in_one_request(name, function):
     peer = Peer(load_modbus_profile(name))
-    peer.drive.announce("setup")                    # before it is known who is there: told when it is
+    peer.drive.announce("setup")                    # before the peer is identified: sent afterwards
     assert peer.told == []
     peer.drive.connect()
     for stage in ("speed", "nothing such", "acquire"):
@@ -50,16 +50,16 @@ def test_each_stage_in_one_request(name, function):
     lambda _reply, complete_s: (None, complete_s), lambda _reply, complete_s: (b"\x86\x02", complete_s),
     lambda _reply, complete_s: (b"\x06", complete_s),
 ])
-def test_a_failure_is_nobodys_concern(becomes):
+def test_a_failed_announcement_is_ignored(becomes):
     peer = Peer(load_modbus_profile("generic/modbus"), becomes=becomes)
     peer.drive.connect()
     began_s = peer.clock.now_s()
     peer.drive.announce("hold")
     assert peer.told == [(6, STAGE_NUMBERS["hold"])]
-    assert peer.clock.now_s() - began_s < 0.06      # it doesn't cost the run its beat
+    assert peer.clock.now_s() - began_s < 0.06      # it does not delay the cycles of the run
 
 
-def test_a_real_drive_is_told_nothing():
+def test_a_real_drive_receives_no_stages():
     peer = Peer(load_modbus_profile("generic/modbus"))
     simulated = peer.serve
 

@@ -37,7 +37,7 @@ def test_words_are_the_bytes_of_struct(drawn, order):
 
 
 @given(st.lists(st.integers(0, 0xFFFF), min_size=2, max_size=2), st.sampled_from(ORDERS))
-def test_every_pattern_of_words_comes_back(words, order):
+def test_every_pattern_of_words_survives_a_round_trip(words, order):
     for kind in ("u32", "i32"):
         assert list(to_words(from_words(words, kind, order), kind, order)) == words
     for kind in ("u16", "i16"):
@@ -53,11 +53,11 @@ def test_one_beyond_the_range_is_rejected(kind):
 
 
 @given(st.sampled_from(sorted(FORMATS)), st.floats(1e-6, 1e3), st.floats(-1e12, 1e12))
-def test_counts_are_the_nearest_that_there_are(kind, per_lsb, value):
+def test_counts_are_rounded_to_the_nearest(kind, per_lsb, value):
     register = Register(address=1, type=kind)
     low, high = RANGES[kind]
     counts = value / per_lsb
-    assume(not (low - 1 < counts < low) and not (high < counts < high + 1))     # rounding decides there
+    assume(not (low - 1 < counts < low) and not (high < counts < high + 1))     # the result depends on rounding here
     if low <= counts <= high:
         found = to_counts(value, per_lsb, register, "here")
         assert low <= found <= high
@@ -69,7 +69,7 @@ def test_counts_are_the_nearest_that_there_are(kind, per_lsb, value):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300])
-def test_what_is_no_number_is_rejected(value):
+def test_a_value_that_is_no_number_is_rejected(value):
     with pytest.raises(CommandRejected):
         to_counts(value, 1.0, Register(address=1, type="i32"), "here")
 
@@ -79,7 +79,7 @@ def test_names():
     assert register_name(Register(address=7, table="input")) == "input register 7"
 
 
-def test_a_setting_is_found_whose_factor_stands_after_it():
+def test_a_setting_whose_factor_comes_later_in_the_file_is_found():
     first, second = (SimpleNamespace(name=name, per_lsb=per_lsb, factor=factor)
                      for name, per_lsb, factor in (("ramp", 0.01, "speed"), ("speed", 0.1, None)))
     both = SimpleNamespace(parameters=(first, second))

@@ -1,4 +1,4 @@
-"""The cycle on a bank of the tests' own, in stepped time: what goes wrong in mid-run, and when a sample is."""
+"""Cycle on a test bank, in stepped time: faults during a run, and the time of a sample."""
 
 import json
 
@@ -21,7 +21,7 @@ PERIOD_S = 0.01
 
 
 class Run:
-    """A drive on a bank, preflight done."""
+    """Drive on a bank, after preflight."""
 
     def __init__(self, profile=GENERIC, bank=None, **options):
         self.bank, self.clock = bank or Bank(**options), SteppedClock()
@@ -54,7 +54,7 @@ def profile_with(**sections):
 
 
 def errors(run, cycles):
-    """(cycle, error) of every error that comes."""
+    """Return (cycle, error) of every error."""
     found = []
     for k in range(cycles):
         try:
@@ -74,7 +74,7 @@ def test_the_words_on_the_way_to_enabled_and_off():
     run.cycle(0.0)
     run.cycle(0.0)
     assert run.controlwords() == [0x00, 0x06, 0x07, 0x0F, 0x02, 0x02, 0x00, 0x00]
-    assert all(request[0] == 23 for request in run.bank.requests)       # one transaction a cycle
+    assert all(request[0] == 23 for request in run.bank.requests)       # one transaction per cycle
 
 
 def test_time_is_the_middle_of_the_transaction():
@@ -89,7 +89,7 @@ def test_time_is_the_middle_of_the_transaction():
 
 
 def test_speed_and_torque_of_two_transactions_are_of_both():
-    """Reads of 17+2 and 19 apart from each other: the half-width covers both and the way between."""
+    """Reads of 17+2 and 19 are separate. The half-width covers both and the time between."""
     split = profile_with(cycle={"functions": [3, 6, 16], "largest_read": 3})
     run = Run(split, takes_s=0.002)
     sample = run.cycle()
@@ -151,7 +151,7 @@ def test_silence_ends_within_half_the_watchdogs_time_and_is_said_once():
     run.bank.writes.clear()
     for _ in range(5):
         run.cycle()
-    # Back on the line there is no enable and no motion, until somebody asks for it.
+    # After the return of the line there is no enable and no motion without a request.
     assert 0x0F not in run.controlwords()
     assert run.bank.machine.state == STOPPING
     assert begun_s < run.clock.now_s()
@@ -209,7 +209,7 @@ def test_a_fault_is_raised_once_and_never_reset():
 
 
 def test_a_fault_reaction_is_no_fault_yet():
-    """The drive brakes by itself, with its power stage on: the error is raised once, and nothing disables it."""
+    """The drive brakes with its power stage on. The error is raised once, and the drive is not disabled."""
     run = Run().enabled()
     run.bank.feedback = lambda: (3000, 0)
     run.cycle()
@@ -224,13 +224,13 @@ def test_a_fault_reaction_is_no_fault_yet():
     run.drive.disable()
     run.cycle()
     words = run.controlwords()
-    assert set(words[1:]) == {0x0002}                 # quick stop; the first one was sent before the state was seen
+    assert set(words[1:]) == {0x0002}                 # quick stop; the first word was sent before the state was known
     run.bank.on_show = lambda words: words.update({STATUS: 0x0218})
     assert run.cycle().state is PowerState.FAULT
     assert not any(word & 0x80 for word in run.controlwords())
 
 
-def test_a_drive_that_fell_out_is_not_enabled_again():
+def test_a_drive_that_left_operation_is_not_enabled_again():
     run = Run().enabled()
     run.bank.machine.state = OFF
     for _ in range(10):
@@ -241,7 +241,7 @@ def test_a_drive_that_fell_out_is_not_enabled_again():
 
 @pytest.mark.parametrize(("status", "speed"), [(0x0000, 0), (0x0000, 3000), (0xFFF7, 3000), (0x0223, 3000)])
 def test_one_status_word_that_makes_no_sense_lets_no_shaft_go(status, speed):
-    """A gateway shows zeros for a cycle, or another state than the drive is in: it is in operation all the same."""
+    """A gateway shows zeros or another state for one cycle, while the drive is in operation."""
     run = Run().enabled()
     run.bank.feedback = lambda: (3000, 0)
     run.cycle()
@@ -290,7 +290,7 @@ def test_a_turning_shaft_is_braked_before_it_is_disabled():
     assert run.bank.machine.state == OFF
 
 
-def test_standstill_from_the_speed_wants_time():
+def test_standstill_from_the_speed_needs_time():
     run = Run().enabled()
     run.bank.feedback = lambda: (300, 0)
     assert not run.cycle().standstill
@@ -299,7 +299,7 @@ def test_standstill_from_the_speed_wants_time():
     assert seen.index(True) == 19       # 20 cycles of 10 ms
     for lost, unsaid in ((1, False), (2, False), (3, True)):
         run.bank.refuse = {23: 6}                                       # busy: no reply to this cycle
-        assert not any(run.cycle().standstill for _ in range(lost))     # nothing is said without a reply
+        assert not any(run.cycle().standstill for _ in range(lost))     # without a reply the state is unknown
         run.bank.refuse = {}
         assert run.cycle().standstill is not unsaid
         seen = [run.cycle().standstill for _ in range(30)]
@@ -311,14 +311,14 @@ def test_creeping_is_no_standstill():
     assert not any(run.cycle().standstill for _ in range(50))
 
 
-def test_standstill_as_the_drive_says():
+def test_standstill_as_the_drive_reports():
     said = profile_with(control={"standstill": {"mask": 0x1000, "value": 0}})
     run = Run(said)
     assert run.cycle().standstill is not bool(run.cycle().status & 0x1000)
 
 
 def test_the_word_after_a_stall_is_a_quick_stop():
-    """A CiA 402 bus leaves it to the stop; the contract has the rest of a frozen loop."""
+    """On a CiA 402 bus the stop does this. The contract tests cover the rest of a frozen loop."""
     run = Run().enabled()
     run.clock.wait_until(run.clock.now_s() + 0.3)
     with pytest.raises(CommunicationLost, match="stood still"):
@@ -328,7 +328,7 @@ def test_the_word_after_a_stall_is_a_quick_stop():
     assert run.controlwords() == [0x02]
 
 
-def test_a_lost_line_is_said_every_time_and_closing_does_not_raise():
+def test_a_lost_line_is_reported_every_time_and_closing_does_not_raise():
     run = Run().enabled()
 
     def gone(unit, pdu, timeout_s):
@@ -336,12 +336,12 @@ def test_a_lost_line_is_said_every_time_and_closing_does_not_raise():
 
     run.link.transact = gone
     assert len(errors(run, 5)) == 5
-    left = run.drive.close()                   # the settings: nobody knows whether it is disabled
+    left = run.drive.close()                   # the settings stay: the host does not know whether it is disabled
     assert len(left) == 6 and all("not restored" in line for line in left)
     assert run.bank.words[40] == 500        # the watchdog stays armed
 
 
-def test_what_could_not_be_given_back_is_said():
+def test_settings_that_could_not_be_restored_are_reported():
     run = Run()
     run.cycle()
     run.bank.refuse_at = {38: 4}
@@ -378,7 +378,7 @@ def test_mode_in_a_register_of_its_own_comes_after_the_seed():
     bank.on_show = lambda words: words.update({9: words[8]})
     run = Run(apart, bank).enabled()
     bank.writes.clear()
-    bank.on_show = lambda words: None           # the display stays where it is
+    bank.on_show = lambda words: None           # the display does not change
     for _ in range(30):
         sample = run.cycle(1.0, 120.0, Mode.TORQUE)
     assert sample.mode is Mode.SPEED
@@ -386,10 +386,10 @@ def test_mode_in_a_register_of_its_own_comes_after_the_seed():
     switches = [k for k, (address, _) in enumerate(bank.writes) if address == 8]
     assert bank.writes[seeds[0]][1][3] == 150                   # 120 of 800 N·m
     assert seeds[0] < switches[0]
-    assert len(switches) == 2                                   # asked for again after 25 cycles
+    assert len(switches) == 2                                   # requested again after 25 cycles
     bank.words[9] = 1
     assert run.cycle(1.0, 120.0, Mode.TORQUE).mode is Mode.TORQUE
-    # Confirmed, it is only looked at now and then.
+    # Once confirmed, it is read occasionally only.
     bank.requests.clear()
     for _ in range(40):
         run.cycle(1.0, 120.0, Mode.TORQUE)
@@ -419,7 +419,7 @@ def test_a_direction_bit_for_a_register_without_sign():
     assert words[0] == 0x400F
     assert words[1:3] == high_and_low(1910)         # 19.1 rpm
     run.cycle(0.0)
-    assert run.controlwords()[-1] == 0x400F         # braked from where it came
+    assert run.controlwords()[-1] == 0x400F         # braked from its former direction
     run.cycle(2.0)
     assert run.controlwords()[-1] == 0x000F
 
@@ -442,7 +442,7 @@ def test_every_pdu_is_tapped():
 
 
 @pytest.mark.parametrize(("damaged", "missed"), [(1, 0), (2, 1)])
-def test_a_damaged_reply_is_asked_for_once_more_within_the_cycle(damaged, missed):
+def test_a_request_with_a_damaged_reply_is_repeated_within_the_cycle(damaged, missed):
     run = Run().enabled()
     transact, left = run.drive._link.transact, [damaged]
 
@@ -459,8 +459,8 @@ def test_a_damaged_reply_is_asked_for_once_more_within_the_cycle(damaged, missed
     assert run.drive.counters.missed - before == missed
 
 
-def test_removing_the_torque_sends_the_word_that_lets_the_shaft_coast():
-    """`off` is a ramp on some drives: under it a shaft that accelerates against its quick stop goes on."""
+def test_removing_the_torque_sends_the_word_for_coasting():
+    """`off` is a ramp on some drives. It would not stop a shaft that accelerates against its quick stop."""
     run = Run(profile_with(control={"coast": 0x0005})).enabled()
     run.drive.quick_stop()
     run.cycle()
@@ -470,7 +470,7 @@ def test_removing_the_torque_sends_the_word_that_lets_the_shaft_coast():
     assert run.controlwords()[-3:] == [0x0005] * 3
 
 
-OFF2, NO_COASTING = 0x0002, 0x0008      # PROFIdrive and the FC profile: 0 in this bit lets the shaft coast
+OFF2, NO_COASTING = 0x0002, 0x0008      # PROFIdrive and the FC profile: the shaft coasts with 0 in this bit
 
 
 @pytest.mark.parametrize(("name", "bit"), [

@@ -1,4 +1,4 @@
-"""Both links against peers that misbehave, over the loopback and over a pty: every trouble comes out typed."""
+"""Both links with faulty peers, over the loopback and over a pty: every fault gives a typed error."""
 
 import contextlib
 import select
@@ -23,8 +23,8 @@ from tests.drivers.modbus_peers import CLOSE, HANGS_S, RESET, SerialPeer, TcpPee
 ASK = bytes.fromhex("03 0010 0002")
 GOOD = bytes.fromhex("03 04 0250 04d2")
 OTHER = bytes.fromhex("03 04 dead beef")
-SHORT_S = 0.1       # for a reply that doesn't come
-LONG_S = HANGS_S    # for one that does
+SHORT_S = 0.1       # for a missing reply
+LONG_S = HANGS_S    # for a reply that arrives
 
 
 def head(request):
@@ -32,12 +32,12 @@ def head(request):
 
 
 def good(request):
-    """The right reply over TCP."""
+    """Return the right reply over TCP."""
     return tcp(*head(request), GOOD)
 
 
 class Hasty(MonotonicClock):
-    """Can be made to jump: what isn't there by then is out of time, however busy this computer is."""
+    """Clock that can jump: a reply that is not there yet is too late, independent of the load of this computer."""
 
     skipped_s = 0.0
 
@@ -49,7 +49,7 @@ class Hasty(MonotonicClock):
 
 
 class Line:
-    """A link and its peer, with the reply's bytes for either kind of line."""
+    """Link and its peer, with the bytes of the reply for each kind of line."""
 
     def __init__(self, kind, behave):
         self.kind = kind
@@ -69,7 +69,7 @@ class Line:
         self.peer.__exit__()
 
     def wait_until_it_lies_there(self):
-        """What was written reaches a pty's other end, or a socket's, when the kernel comes to it."""
+        """Wait until the kernel has delivered the written bytes to the other end of a pty or socket."""
         link, end_s = self.link, time.monotonic() + HANGS_S
         while not (link._port.in_waiting if self.kind == "rtu" else select.select((link._socket,), (), (), 0)[0]):
             assert time.monotonic() < end_s
@@ -102,7 +102,7 @@ def test_a_transaction(kind):
 
 
 def test_the_crc_of_the_specification():
-    """A frame of the serial-line guide: 02 07 has CRC 41 12."""
+    """The frame 02 07 of the serial-line guide has CRC 41 12."""
     assert crc(bytes.fromhex("0207")) == bytes.fromhex("4112")
 
 
@@ -138,7 +138,7 @@ def test_silence(kind):
 
 @KINDS
 def test_a_late_reply_is_not_taken_for_the_next(kind):
-    """It comes once its time was over, and says something else."""
+    """The late reply arrives after the time-out, with other data."""
     over = threading.Event()
 
     def behave(number, request):
@@ -155,7 +155,7 @@ def test_a_late_reply_is_not_taken_for_the_next(kind):
 
 @KINDS
 def test_a_reply_so_late_that_the_next_request_is_out(kind):
-    """The old reply comes right before the new one: same unit, function and length."""
+    """The old reply arrives directly before the new one, with the same unit, function and length."""
     kept = []
 
     def behave(number, request):
@@ -166,7 +166,7 @@ def test_a_reply_so_late_that_the_next_request_is_out(kind):
         return [*late, reply(kind, request)]
 
     with Line(kind, behave) as line:
-        line.link._usual_s = LONG_S        # so long a good reply has taken before: so long it waits for the right one
+        line.link._usual_s = LONG_S        # the wait for the right reply is as long as an earlier good reply took
         with pytest.raises(NoReply):
             line.ask(SHORT_S)
         assert [line.ask().pdu for _ in range(3)] == [GOOD] * 3
@@ -174,7 +174,7 @@ def test_a_reply_so_late_that_the_next_request_is_out(kind):
 
 
 @KINDS
-def test_a_reply_nobody_asked_for_is_thrown_away(kind):
+def test_an_unrequested_reply_is_discarded(kind):
     over = threading.Event()
 
     def behave(number, request):
@@ -191,7 +191,7 @@ def test_a_reply_nobody_asked_for_is_thrown_away(kind):
 
 @KINDS
 @pytest.mark.parametrize("wrong", ["unit", "function"])
-def test_a_reply_of_somebody_else(kind, wrong):
+def test_a_reply_of_another_unit(kind, wrong):
     def behave(number, request):
         if number:
             return [reply(kind, request)]
@@ -217,7 +217,7 @@ def test_a_wrong_transaction_id_costs_the_connection():
 
 
 @pytest.mark.parametrize("rubbish", [b"HTTP/1.1 400 Bad Request\r\n", bytes(6) + b"\x01\x03", b"\0\1\0\0\xff\xff\1\3"])
-def test_what_is_no_modbus_frame(rubbish):
+def test_frames_that_are_not_modbus(rubbish):
     with Line("tcp", lambda number, request: [rubbish if number == 0 else good(request)]) as line:
         with pytest.raises(BadReply, match="not a Modbus frame"):
             line.ask()
@@ -272,7 +272,7 @@ def test_a_connection_that_ends_is_not_opened_again(ending):
 
 
 def test_nothing_queues_up_on_a_connection_that_takes_nothing():
-    """The other end neither reads nor acknowledges: its buffers are full, as behind a cable that is out."""
+    """The other end neither reads nor acknowledges, as with an unplugged cable, so its buffers are full."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
         link = TcpLink("127.0.0.1", listener.getsockname()[1], MonotonicClock())
@@ -299,16 +299,16 @@ def test_the_adapter_is_unplugged():
                 line.ask(SHORT_S)
 
 
-def test_nothing_listens():
+def test_no_server_listens():
     with socket.socket() as taken, pytest.raises(PreflightRefused, match="nothing listens") as caught:
-        taken.bind(("127.0.0.1", 0))           # and nobody else listens there meanwhile
+        taken.bind(("127.0.0.1", 0))           # and no other server listens there
         port = taken.getsockname()[1]
         TcpLink("127.0.0.1", port, MonotonicClock())
     assert str(port) in caught.value.where
     assert caught.value.next_step
 
 
-def test_an_address_that_does_not_answer(monkeypatch):
+def test_an_address_that_does_not_reply(monkeypatch):
     def silent(*_, **__):
         raise TimeoutError("timed out")
 
@@ -330,7 +330,7 @@ def test_on_other_systems_the_kernel_is_not_asked_for_what_was_not_acknowledged(
             link.close()
 
 
-def test_sending_has_the_time_of_its_reply_whatever_was_waited_before(monkeypatch):
+def test_sending_has_the_time_of_its_reply_after_any_earlier_wait(monkeypatch):
     waits, plain = [], socket.socket.sendall
 
     def watched(self, data):
@@ -346,7 +346,7 @@ def test_sending_has_the_time_of_its_reply_whatever_was_waited_before(monkeypatc
     assert waits == [LONG_S]
 
 
-def test_a_request_that_the_connection_does_not_take_in_time_gets_no_reply(monkeypatch):
+def test_a_request_that_cannot_be_sent_in_time_gets_no_reply(monkeypatch):
     def full(self, data):
         raise TimeoutError("timed out")
 
@@ -384,7 +384,7 @@ def test_a_device_in_use():
 @pytest.mark.parametrize("parity", ["N", "E", "O"])
 @pytest.mark.parametrize("baud", [9600, 19200, 115200])
 def test_settings_of_the_line(parity, baud):
-    """A pty takes them all, though none means anything to it."""
+    """A pty accepts all settings without any effect."""
     with SerialPeer(lambda number, request: [rtu(1, GOOD)]) as peer:
         link = RtuLink(peer.device, MonotonicClock(), baud=baud, parity=parity, stop_bits=2)
         assert link.transact(1, ASK, LONG_S).pdu == GOOD
@@ -403,7 +403,7 @@ def test_permission_names_the_command(tmp_path):
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.binary(max_size=12) | st.sampled_from([tcp(1, 1, GOOD), tcp(1, 1, b"\x83\x02"), tcp(1, 2, GOOD)])))
-def test_whatever_comes_over_tcp_is_a_reply_or_a_typed_error(pieces):
+def test_any_bytes_over_tcp_give_a_reply_or_a_typed_error(pieces):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         link = TcpLink("127.0.0.1", listener.getsockname()[1], MonotonicClock())
         other, _ = listener.accept()
@@ -416,7 +416,7 @@ def test_whatever_comes_over_tcp_is_a_reply_or_a_typed_error(pieces):
 
 
 class JunkPort:
-    """Quacks like a serial port: what is to come comes once something was written."""
+    """Port with the interface of a serial port: the reply arrives after a write."""
 
     def __init__(self, data):
         self.data, self.coming = data, b""
@@ -440,7 +440,7 @@ class JunkPort:
 
 @pytest.fixture
 def line_of_junk():
-    """A serial line whose port is set by the test."""
+    """Return a serial line with a port that the test sets."""
     peer = SerialPeer(lambda number, request: [])
     link = RtuLink(peer.device, MonotonicClock(), parity="N")
     link.close()
@@ -449,7 +449,7 @@ def line_of_junk():
     return link
 
 
-def test_a_reply_that_comes_while_the_line_is_listened_to_is_late(line_of_junk):
+def test_a_reply_during_the_listening_time_is_late(line_of_junk):
     pieces = iter([b"", rtu(1, OTHER)])
     line_of_junk._port = SimpleNamespace(in_waiting=0, read=lambda _: next(pieces, b""))
     line_of_junk._owed, line_of_junk._listen_s = True, LONG_S
@@ -458,7 +458,7 @@ def test_a_reply_that_comes_while_the_line_is_listened_to_is_late(line_of_junk):
 
 
 def test_a_line_that_was_lost_stays_lost(line_of_junk):
-    """The adapter may come back with another drive behind it, or in mid-frame."""
+    """The adapter may return with another drive, or within a frame."""
     def broken(_frame):
         raise OSError(5, "Input/output error")
 
@@ -471,7 +471,7 @@ def test_a_line_that_was_lost_stays_lost(line_of_junk):
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=12) | st.sampled_from([rtu(1, GOOD), rtu(1, b"\x83\x02"), rtu(2, GOOD)])))
-def test_whatever_comes_over_a_serial_line_is_a_reply_or_a_typed_error(pieces):
+def test_any_bytes_over_a_serial_line_give_a_reply_or_a_typed_error(pieces):
     peer = SerialPeer(lambda number, request: [])
     link = RtuLink(peer.device, MonotonicClock(), parity="N")
     link.close()
@@ -483,7 +483,7 @@ def test_whatever_comes_over_a_serial_line_is_a_reply_or_a_typed_error(pieces):
     assert link.transact(1, ASK, LONG_S).pdu == GOOD
 
 
-def test_the_embedded_line_drops_what_comes_too_late():
+def test_the_embedded_line_drops_late_replies():
     clock = MonotonicClock()
     link = EmbeddedLink(lambda unit, pdu, now_s: (GOOD, now_s + 1.0), clock)
     with pytest.raises(NoReply):
@@ -491,8 +491,8 @@ def test_the_embedded_line_drops_what_comes_too_late():
     assert link.late == 1
 
 
-def test_what_is_queued_is_thrown_away_when_the_connection_is_closed():
-    """A setpoint that the drive's system hasn't taken yet must not reach it after the host has gone."""
+def test_queued_data_are_discarded_when_the_connection_is_closed():
+    """A setpoint that is still queued must not reach the drive after the end of the host."""
     setpoint = bytes.fromhex("0001 0000 0006 01 06 0001 0fa0")
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
@@ -500,18 +500,18 @@ def test_what_is_queued_is_thrown_away_when_the_connection_is_closed():
         drive, _ = server.accept()
         with drive:
             link._socket.setblocking(False)
-            with pytest.raises(BlockingIOError):        # until both systems hold as much as they can
+            with pytest.raises(BlockingIOError):        # until the buffers of both systems are full
                 while True:
                     link._socket.send(1000 * setpoint)
             link.close()
             drive.settimeout(HANGS_S)
-            with pytest.raises(ConnectionResetError):   # an orderly end would be all of it, and then nothing
+            with pytest.raises(ConnectionResetError):   # an orderly close would deliver all data first
                 while drive.recv(100_000):
                     pass
 
 
 def test_replies_that_come_twice_cost_nothing():
-    """A gateway that says everything twice: the second one bears an id that was answered already."""
+    """A gateway sends each reply twice. The second one has a transaction id that is already complete."""
     with TcpPeer(lambda number, request: [good(request), good(request)]) as peer:
         link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
         for _ in range(50):
@@ -522,7 +522,7 @@ def test_replies_that_come_twice_cost_nothing():
 
 
 def test_foreign_replies_cost_the_connection_a_few_times_only():
-    """Then they are dropped, and the right one is waited for."""
+    """After that, foreign replies are dropped, and the link waits for the right one."""
     with TcpPeer(lambda number, request: [tcp(0xF000 + number, 1, OTHER), good(request)]) as peer:
         link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
         answered = 0
@@ -535,7 +535,7 @@ def test_foreign_replies_cost_the_connection_a_few_times_only():
 
 
 def test_the_connection_before_is_closed_when_another_is_opened():
-    """A drive may serve one connection only."""
+    """A drive may accept one connection only."""
     with TcpPeer(lambda number, request: [tcp(0xF000 + number, 1, OTHER), good(request)]) as peer:
         link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
         before = link._socket
@@ -547,7 +547,7 @@ def test_the_connection_before_is_closed_when_another_is_opened():
 
 
 def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
-    """A foreign reply, and then nobody takes the new connection: the cycle goes on, and the stop can."""
+    """After a foreign reply, the new connection is not accepted. The cycle continues, so a stop is possible."""
     with (
         TcpPeer(lambda number, request: [tcp(0xF000, 1, OTHER)]) as peer,
         socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as waiting,
@@ -557,7 +557,7 @@ def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
             link.transact(1, ASK, LONG_S)
         link.clock = SteppedClock()
         link._peer = full.getsockname()
-        for _ in range(4):             # its queue is full from here on, and further ones are left without an answer
+        for _ in range(4):             # its queue is full from here on, and further connections get no reply
             one = waiting.enter_context(socket.socket())
             one.setblocking(False)
             one.connect_ex(link._peer)
@@ -573,13 +573,13 @@ def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
                 link.transact(1, ASK, 0.02)
         assert waited == [0.02] * 5
         link.clock.wait_until(0.6)
-        with pytest.raises(LinkLost):  # and it is given up in the end
+        with pytest.raises(LinkLost):  # and it is finally given up
             link.transact(1, ASK, 0.02)
         link.close()
 
 
 class Babble:
-    """A serial port on a line that is never quiet: another device transmits without a pause."""
+    """Serial port on a line that is never silent: another device transmits without a pause."""
 
     in_waiting = 1
 

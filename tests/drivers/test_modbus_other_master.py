@@ -1,4 +1,4 @@
-"""Somebody else writes to a Modbus drive: what is noticed, by which register, and that nothing else is taken for it."""
+"""Another master writes to a Modbus drive: which register shows it, and cases that must not be reported."""
 
 import struct
 
@@ -16,7 +16,7 @@ REACTION, TORQUE_LIMIT, QUICK_STOP = 41, 38, 39
 
 
 class Run:
-    """An enabled drive on a bank. ``foreign`` is written into the bank after each reply of the cycle."""
+    """Enabled drive on a bank. ``foreign`` is written into the bank after each reply of the cycle."""
 
     def __init__(self, profile=GENERIC, bank=None, speed=2.0):
         self.bank = bank or Bank()
@@ -49,7 +49,7 @@ class Run:
         return sample
 
     def lost(self, within_s):
-        """The one error, and when it came."""
+        """Return the only error and its cycle."""
         with pytest.raises(CommunicationLost) as caught:
             self.cycles(round(within_s * RATE_HZ))
         return caught.value
@@ -60,14 +60,14 @@ class Run:
     ({TORQUE_SETPOINT: 500}, "torque setpoint", "400 N·m", "0 N·m", "register 3"),
     ({CONTROL: 0x010F}, "control word", "010Fh", "000Fh", "register 0"),
 ])
-def test_foreign_words_are_named_with_ours_beside_them(words, name, other, ours, where):
+def test_foreign_words_are_reported_beside_ours(words, name, other, ours, where):
     run = Run()
     run.foreign = words
     error = run.lost(1.0)
     assert f"the {name} in the drive is {other}, and this run wrote {ours}" in error.what
     assert where in error.where and "other master" in error.next_step
     run.foreign = {}
-    run.cycles(40)                                             # told once: the stop goes on
+    run.cycles(40)                                             # reported once, so that the stop continues
 
 
 @pytest.mark.parametrize(("address", "value", "was", "now"), [
@@ -82,8 +82,8 @@ def test_a_setting_that_changed_is_named(address, value, was, now):
     assert was in error.what and now in error.what and "changed a setting" in error.what
 
 
-def test_a_run_by_itself_is_left_alone():
-    """Setpoints that move every cycle, both modes, an adapter that shows what was written some cycles ago."""
+def test_a_run_without_another_master_raises_nothing():
+    """The setpoints change every cycle, in both modes, and the adapter shows values of some cycles ago."""
     run = Run()
     late = []
 
@@ -107,7 +107,7 @@ def test_a_run_by_itself_is_left_alone():
 
 
 class WriteOnly(Bank):
-    """Its control word reads as 0 for ever, or none of its words can be read."""
+    """Drive whose control word always reads as 0, or whose words cannot be read."""
 
     def __init__(self, how):
         super().__init__()
@@ -123,12 +123,12 @@ class WriteOnly(Bank):
 
 
 @pytest.mark.parametrize("how", ["zero", "refused"])
-def test_a_drive_that_does_not_show_its_words_is_not_accused(how):
+def test_a_drive_that_does_not_show_its_words_raises_nothing(how):
     assert Run(bank=WriteOnly(how)).cycles(100).fresh
 
 
-def test_looks_are_few_and_never_in_the_way():
-    """Ten a second at most, one request each, before the cycle's; without an answer they are none."""
+def test_read_backs_are_rare_and_do_not_delay_the_cycle():
+    """Read-backs come at most ten times per second, before the request of the cycle. A missing reply has no effect."""
     run = Run()
     run.bank.requests.clear()
     run.cycles(round(10.0 * RATE_HZ))
@@ -139,7 +139,7 @@ def test_looks_are_few_and_never_in_the_way():
     assert run.cycles(20).fresh and run.drive.counters.missed == 0
 
 
-def test_a_tight_line_is_looked_at_less_often():
+def test_a_slow_line_has_fewer_read_backs():
     bank = Bank(takes_s=0.03)
     run = Run(changed(GENERIC, watchdog={}), bank)
     run.bank.requests.clear()
@@ -149,8 +149,8 @@ def test_a_tight_line_is_looked_at_less_often():
     assert sum(pdu[0] == 3 for pdu in run.bank.requests) <= 21
 
 
-def test_the_stop_word_is_repeated_against_somebody_who_goes_on():
-    """Within the period, as often as the line carries it; enabled again is told, too."""
+def test_the_stop_word_is_repeated_against_another_master_that_continues():
+    """It is repeated within the period as often as the line permits. A new enable is reported too."""
     run = Run(bank=Bank(takes_s=0.002))
     run.foreign = {CONTROL: 0x000F}
     run.drive.quick_stop()
@@ -175,7 +175,7 @@ def test_silence_is_refused_where_the_other_master_feeds_the_watchdog_too():
     ("requests_of_this_connection", 0.75),
 ])
 def test_left_to_its_watchdog_the_drive_is_only_read(fed_by, silent_s):
-    """Not even that while reading feeds it; then it is read again, and disabled once it is at rest."""
+    """It is not read while reading feeds the watchdog. Then it is read again, and disabled at standstill."""
     profile = changed(GENERIC, watchdog={"fed_by": fed_by, "fed_by_confidence": "verified"})
     run = Run(profile)
     run.drive.quick_stop()
@@ -195,7 +195,7 @@ def test_left_to_its_watchdog_the_drive_is_only_read(fed_by, silent_s):
     assert run.cycles(20).state is PowerState.OFF
 
 
-def test_somebody_who_changes_the_mode_does_not_hide_the_words():
+def test_a_foreign_change_of_the_mode_does_not_hide_the_words():
     run = Run()
     run.foreign = {MODE: 1, TORQUE_SETPOINT: 100}
     assert "torque setpoint" in run.lost(1.0).what

@@ -1,4 +1,4 @@
-"""Request and reply PDUs: the specification's own examples, and pymodbus as the other side."""
+"""Request and reply PDUs: examples of the specification, and pymodbus as the peer."""
 
 import pytest
 from hypothesis import given
@@ -38,7 +38,7 @@ def test_the_specifications_examples(request_pdu, bytes_out, bytes_in, words):
 
 
 @given(st.integers(0, 0xFF00), WORDS, st.integers(0, 0xFF00), st.integers(1, 125))
-def test_the_other_side_understands(address, words, read_address, count):
+def test_pymodbus_decodes_the_requests(address, words, read_address, count):
     seen = OTHER_SIDE.decode(pdu.write_many(address, words))
     assert (seen.function_code, seen.address, list(seen.registers)) == (16, address, words)
     seen = OTHER_SIDE.decode(pdu.write_one(address, words[0]))
@@ -68,7 +68,7 @@ def test_exceptions_are_typed_and_named(request_pdu, code):
 
 
 @given(st.sampled_from([entry[0] for entry in EXAMPLES]), st.binary(max_size=20))
-def test_no_rubbish_passes_for_a_reply(request_pdu, reply):
+def test_no_random_bytes_are_accepted_as_a_reply(request_pdu, reply):
     count = {3: 3, 4: 1, 6: 0, 16: 0, 23: 6}[request_pdu[0]]
     try:
         words = pdu.words_of(request_pdu, reply)
@@ -80,7 +80,7 @@ def test_no_rubbish_passes_for_a_reply(request_pdu, reply):
 
 
 @pytest.mark.parametrize(("request_pdu", "bytes_out", "bytes_in", "words"), EXAMPLES)
-def test_a_bit_that_flips_in_the_head_is_noticed(request_pdu, bytes_out, bytes_in, words):
+def test_a_flipped_bit_in_the_header_is_found(request_pdu, bytes_out, bytes_in, words):
     good = h(bytes_in)
     head = len(good) if not words else 2
     for bit in range(8 * head):
@@ -94,13 +94,13 @@ def test_a_bit_that_flips_in_the_head_is_noticed(request_pdu, bytes_out, bytes_i
 
 
 @pytest.mark.parametrize(("address", "count"), [(0, 0), (0, 126), (0xFFFF, 2), (-1, 1)])
-def test_what_no_request_can_hold(address, count):
+def test_invalid_read_requests(address, count):
     with pytest.raises(ValueError, match="not possible in one request"):
         pdu.read(3, address, count)
 
 
 def test_the_count_of_requests_is_that_of_the_drive():
-    """Section 6.8: function and sub-function come back, then the count."""
+    """Section 6.8: the reply has function and sub-function, then the count."""
     asked = pdu.count_requests()
     assert asked == h("08 000e 0000")
     assert pdu.words_of(asked, h("08 000e a537")) == (0xA537,)
@@ -114,11 +114,11 @@ def test_the_count_of_requests_is_that_of_the_drive():
     lambda: pdu.read_write(0, 126, 0, (1,)), lambda: pdu.read_write(0, 1, 0xFFFF, (1, 2)),
     lambda: pdu.read_write(0, 1, 0, (0,) * 122),
 ])
-def test_nor_can_a_request_that_writes(made):
+def test_invalid_write_requests(made):
     with pytest.raises(ValueError, match="not possible in one request"):
         made()
 
 
-def test_what_is_wrong_with_a_line_has_a_message_each():
+def test_each_fault_of_a_line_has_its_own_message():
     errors = (pdu.NoReply, BadReply, pdu.LinkLost)
     assert [one.entry for one in errors] == [MessageCode.NO_REPLY, MessageCode.BAD_REPLY, MessageCode.LINK_LOST]

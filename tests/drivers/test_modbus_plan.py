@@ -1,4 +1,4 @@
-"""From registers to transactions: the fewest that there can be, and none that touches what nobody asked for."""
+"""Plan of transactions for registers: the smallest number, without access to other registers."""
 
 import copy
 import itertools
@@ -18,7 +18,7 @@ WHENCE = {"source": "made up for a test", "confidence": "unverified"}
 
 def profile(*, control=0, speed_setpoint=1, torque_setpoint=3, status=16, speed=17, torque=19, demand=None,
             wide=False, mode=None, display=None, **cycle):
-    """generic/modbus with another map."""
+    """Return generic/modbus with another map."""
     data = copy.deepcopy(GENERIC)
 
     def signal(address, **more):
@@ -55,14 +55,14 @@ def test_the_generic_drive_takes_one_transaction():
 
 
 def test_classic_words_side_by_side():
-    """ABB's classic layout: three words out, three words in."""
+    """ABB's classic layout has three output words and three input words."""
     layout = {"control": 0, "speed_setpoint": 1, "torque_setpoint": 2, "status": 3, "speed": 4, "torque": 5}
     assert texts(plan_cycle(profile(**layout, functions=(3, 6, 16, 23))).cycle) == ["23 writes 0+3 reads 3+3"]
     assert texts(plan_cycle(profile(**layout, functions=(3, 6, 16))).cycle) == ["16 writes 0+3", "3 reads 3+3"]
 
 
 def test_scattered_registers():
-    """Setpoint before control word; a gap that may be read along; speed and torque last, one after the other."""
+    """The setpoint comes before the control word, a gap may be read too, and speed and torque come last."""
     layout = {"control": 8501, "speed_setpoint": 8602, "torque_setpoint": 8603, "status": 3201, "speed": 8604,
               "torque": 3226}
     plain = plan_cycle(profile(**layout, functions=(3, 6, 16), largest_gap=30))
@@ -73,7 +73,7 @@ def test_scattered_registers():
     assert texts(apart.cycle)[2:] == ["3 reads 3201+1", "3 reads 3226+1", "3 reads 8604+1"]
 
 
-def test_what_is_not_needed_every_cycle_rides_along_only_where_it_is_free():
+def test_optional_registers_are_read_only_if_that_costs_no_request():
     free = plan_cycle(profile(mode=4, display=20, demand=21, torque_setpoint=3, speed_setpoint=2, control=1,
                               status=17, speed=18, torque=19))
     assert texts(free.cycle) == ["23 writes 1+4 reads 17+5"]
@@ -97,7 +97,7 @@ def test_half_a_number_is_never_written():
         plan_cycle(profile(wide=True, speed_setpoint=1, torque_setpoint=3, speed=17, torque=19, functions=(3, 6)))
 
 
-def test_a_drive_that_nothing_can_be_written_to():
+def test_a_drive_without_writable_registers():
     with pytest.raises(PreflightRefused, match="can't be written"):
         plan_cycle(profile(functions=(3,)))
 
@@ -123,7 +123,7 @@ def test_any_layout(made):
     addresses = {one.address + k for one in asked for k in range(one.count)}
     written = [one.write for one in (*plan.cycle, *plan.mode_writes) if one.write is not None]
     covered = [span.address + k for span in written for k in range(span.length)]
-    assert sorted(covered) == sorted(addresses)                 # each once, and nothing that nobody asked for
+    assert sorted(covered) == sorted(addresses)                 # each once, and no other register
     reads = [one.read for one in plan.cycle if one.read is not None]
     assert all(any(span.covers(register) for span in reads) for register in wanted)
     assert all(span.length <= cycle.largest_read for span in reads)
@@ -139,7 +139,7 @@ def test_any_layout(made):
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.sampled_from(["i16", "i32"])), min_size=1, max_size=6),
        st.integers(0, 5), st.integers(2, 12))
-def test_no_fewer_spans_would_do(drawn, gap, most):
+def test_no_smaller_number_of_spans_is_possible(drawn, gap, most):
     registers, free = [], 0
     for skip, kind in drawn:
         registers.append(Register(address=free + skip, type=kind))

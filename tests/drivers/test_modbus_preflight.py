@@ -1,4 +1,4 @@
-"""Before motion: the marker, the whole table on a right drive, and every wrong of a register map, on a bank of ours."""
+"""Preflight on a test bank: the marker, the whole table for a right drive, and each error of a register map."""
 
 import dataclasses
 import itertools
@@ -31,12 +31,12 @@ def bank():
 
 
 def of(data):
-    """As the file would be read: strict, and arrays are tuples."""
+    """Return the profile as read from a file: strict, with tuples for arrays."""
     return ModbusProfile.model_validate_json(json.dumps(data))
 
 
 def changed(profile, **parts):
-    """The profile with other parameters, by name; whole sections by theirs."""
+    """Return the profile with other parameters or other sections, by name."""
     data = profile.model_dump(by_alias=True)
     for name, change in parts.items():
         if name in data and not isinstance(data[name], str):
@@ -52,7 +52,7 @@ def drive_on(bank, profile, clock=None, **options):
 
 
 def refused(bank, profile, limits=LIMITS, **options):
-    """Preflight's refused rows by name; nothing may have moved."""
+    """Return the refused rows of preflight by name, and assert that nothing moved."""
     drive = drive_on(bank, profile, **options)
     drive.connect()
     found = drive.preflight(limits)
@@ -62,7 +62,7 @@ def refused(bank, profile, limits=LIMITS, **options):
     return {check.name: check for check in found.refused}
 
 
-def test_a_drive_that_is_right(bank, generic):
+def test_a_right_drive(bank, generic):
     before = dict(bank.words)
     drive = drive_on(bank, generic)
     identity = drive.connect()
@@ -79,7 +79,7 @@ def test_a_drive_that_is_right(bank, generic):
     assert [bank.words[at] for at in range(4)] == [0, 0, 0, 0]
     assert drive.close() == ()
     bank.show()
-    # The status word isn't a setting: the drive never left 'switch on disabled'.
+    # The status word shows that the drive never left 'switch on disabled'.
     assert {at: word for at, word in bank.words.items() if at != STATUS} == {
         at: word for at, word in before.items() if at != STATUS
     }
@@ -106,7 +106,7 @@ def test_silence(bank, generic):
     assert "--unit" in caught.value.next_step
 
 
-def test_a_drive_that_is_driven_already(bank, generic):
+def test_a_drive_that_is_already_enabled(bank, generic):
     bank.machine.state = "operation enabled"
     with pytest.raises(PreflightRefused, match="another master"):
         drive_on(bank, generic).connect()
@@ -164,7 +164,7 @@ def test_a_turning_shaft_and_local_control(bank, generic):
 
 @pytest.mark.parametrize("first", range(3))
 def test_one_reading_of_noise_is_no_turning_shaft(bank, generic, first):
-    """0.105 rad/s in each third reading: one of the three begins with it."""
+    """Each third reading is 0.105 rad/s. One of the three cases begins with it."""
     readings = itertools.cycle([100, 5, -5][first:] + [100, 5, -5][:first])
     bank.feedback = lambda: (next(readings), 0)
     assert "state" not in refused(bank, generic)
@@ -172,8 +172,8 @@ def test_one_reading_of_noise_is_no_turning_shaft(bank, generic, first):
     assert "0.105 rad/s" in refused(bank, generic)["state"].found
 
 
-def test_a_slow_run_takes_the_noise_of_the_rig_for_noise(bank, generic):
-    """--highest-speed: the run's limit is lower, and the signal at rest is the same."""
+def test_a_slow_run_accepts_the_noise_of_the_rig(bank, generic):
+    """With --highest-speed the limit of the run is lower, and the signal at standstill is the same."""
     bank.feedback = lambda: (40, 0)         # 0.042 rad/s: 0.4 % of the rig's limit of 10 rad/s
     slow = dataclasses.replace(LIMITS, speed_rad_s=3.0)
     assert "state" in refused(bank, generic, slow)
@@ -188,18 +188,18 @@ def test_a_fault_reaction_is_refused(bank, generic):
 
 
 def test_three_coarse_counts_are_no_standstill(bank, generic):
-    """A count of 1 rpm: 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
+    """A count is 1 rpm. 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
     bank.feedback = lambda: (3, 0)
     plain = generic.model_dump(by_alias=True)
     plain["cycle"]["speed"] |= {"per_lsb": 1.0}
     assert "0.314 rad/s" in refused(bank, of(plain))["state"].found
 
 
-# -- wrongs of a whole map: the drive is right, the profile has it wrong throughout, or the other way round ----------
+# -- errors of a whole map: in the profile for a right drive, or in the drive ----------
 
 
 def every_register(profile, change):
-    """The profile with ``change(entry)`` made to each register, and to whatever has a scale."""
+    """Return the profile with ``change(entry)`` in each register and in each entry with a scale."""
     def walk(part):
         if isinstance(part, dict):
             change(part)
@@ -241,7 +241,7 @@ def shift(by):
     ("one too low", lambda profile: every_register(profile, shift(-1))),
     ("sign", lambda profile: every_register(profile, swap_sign)),
 ])
-def test_a_map_that_is_wrong_throughout_is_caught_before_anything_is_written(bank, generic, title, wrong):
+def test_an_error_in_the_whole_map_is_found_before_any_write(bank, generic, title, wrong):
     profile = wrong(generic)
     rows = refused(bank, profile)
     assert rows, title
@@ -262,13 +262,13 @@ def test_one_known_register_that_is_wrong(bank, generic, name, wrong):
 @pytest.mark.parametrize("setpoint", ["speed_setpoint", "torque_setpoint"])
 @pytest.mark.parametrize("wrong", ["times 10", "one off", "16 bit"])
 def test_one_setpoint_that_is_wrong(bank, generic, setpoint, wrong):
-    """The known registers are all right: only the drive's own echo can tell."""
+    """All known registers are right: only the echo of the drive shows the error."""
     data = generic.model_dump(by_alias=True)
     entry = data["cycle"][setpoint]
     if wrong == "times 10":
         entry["per_lsb"] *= 10.0
     elif wrong == "one off":
-        # The registers 5 to 9 take anything and do nothing.
+        # The registers 5 to 9 accept any value and have no function.
         entry["register"]["address"] = 6
     elif setpoint == "torque_setpoint":
         entry["register"]["address"] = 2
@@ -279,7 +279,7 @@ def test_one_setpoint_that_is_wrong(bank, generic, setpoint, wrong):
 
 
 def test_setpoint_with_its_halves_swapped(bank, generic):
-    """The drive takes 32-bit setpoints the other way round than everything else."""
+    """The drive has the opposite word order for 32-bit setpoints only."""
     def swap(address, words):
         if address == SPEED_SETPOINT:
             bank.words[1], bank.words[2] = words[1], words[0]
@@ -290,7 +290,7 @@ def test_setpoint_with_its_halves_swapped(bank, generic):
 
 @pytest.mark.parametrize("address", [1, 3, 4, 36, 37, 38, 39, 40])
 def test_a_write_that_is_taken_but_not_applied(bank, generic, address):
-    """With function 16 a setpoint's two registers are written together: deaf to both halves."""
+    """Function 16 writes both registers of a setpoint together, and the drive ignores both."""
     bank.deaf_to = {address, 2} if address == 1 else {address}
     rows = refused(bank, generic)
     assert rows
@@ -303,12 +303,12 @@ def test_a_register_that_the_drive_refuses(bank, generic, address, code):
     bank.refuse_at = {address: code}
     rows = refused(bank, generic)
     if address == 45:
-        assert rows == {}           # a filter that isn't told is a note
+        assert rows == {}           # an unknown filter gives a note
     else:
         assert any(f"exception {code}" in check.found for check in rows.values())
 
 
-def test_a_busy_drive_is_asked_again_but_not_for_ever(bank, generic):
+def test_a_busy_drive_is_asked_again_for_a_bounded_time(bank, generic):
     bank.script = [lambda reply: bytes((reply[0] | 0x80, 6))] * 3
     drive = drive_on(bank, generic)
     drive.connect()
@@ -321,7 +321,7 @@ def test_a_busy_drive_is_asked_again_but_not_for_ever(bank, generic):
 
 
 def test_the_checklist(bank, generic):
-    """What must be set by hand: each wrong one with its title, register and advice, all at once."""
+    """Settings that must be made by hand: all wrong ones are listed, each with title, register and advice."""
     bank.words[41] = 1
     bank.words[44] = 7
     profile = changed(generic, time_out_reaction={"advice": "Set 41 to 3 at the drive"})
@@ -333,7 +333,7 @@ def test_the_checklist(bank, generic):
     assert refused(bank, profile) == {}
 
 
-def test_what_the_drive_can_not_tell_must_be_given(bank, generic):
+def test_values_that_the_drive_does_not_report_must_be_stated(bank, generic):
     profile = changed(generic, rated_speed={"register": None}, rated_torque={"register": None})
     rows = refused(bank, profile)
     assert {"rated torque", "rated speed"} <= set(rows)
@@ -347,15 +347,15 @@ def test_rig_and_drive_must_agree_on_the_rated_torque(bank, generic):
     assert refused(bank, generic, rated_torque_nm=800.0) == {}
 
 
-def test_scales_that_hang_on_parameters(generic):
-    """Raw x per_lsb x value of another parameter: 16384 counts are the reference speed."""
+def test_scales_that_depend_on_parameters(generic):
+    """The value is raw x per_lsb x another parameter: 16384 counts are the reference speed."""
     data = generic.model_dump(by_alias=True)
     data["cycle"]["speed_setpoint"] |= {"per_lsb": 0.01 / 200.0, "times": "rated_speed"}
     data["cycle"]["speed"] |= {"per_lsb": 0.01 / 200.0, "times": "rated_speed"}
     profile = of(data)
     bank = Bank()
     assert refused(bank, profile) == {}
-    # With another reference at the drive the echo no longer fits (nor does the name plate).
+    # With another reference in the drive, neither the echo nor the name plate agrees.
     bank.words[35] = 2100
     assert refused(bank, changed(profile, name_plate=None))
 
@@ -371,13 +371,13 @@ def test_a_watchdog_that_is_not_there(bank, generic, watchdog, words, wrong):
 
 @pytest.mark.parametrize(("counts", "good"), [(0, False), (40, False), (300, True), (500, True), (501, False)])
 def test_a_watchdog_that_is_set_by_hand(bank, generic, counts, good):
-    """Not longer than rig.yaml wants it, and at least five cycles of 10 ms."""
+    """It is at most that of rig.yaml, and at least five cycles of 10 ms."""
     bank.words[TIME_OUT] = counts
     profile = changed(generic, time_out={"set_to": None})
     assert set(refused(bank, profile)) == (set() if good else {"watchdog"})
 
 
-def test_a_coasting_reaction_is_said(bank, generic):
+def test_a_coasting_reaction_is_reported(bank, generic):
     drive = drive_on(bank, changed(generic, watchdog={"reaction": "coast"}))
     drive.connect()
     found = drive.preflight(LIMITS)
@@ -385,7 +385,7 @@ def test_a_coasting_reaction_is_said(bank, generic):
     assert any(check.name == "watchdog reaction" and check.found == "coast" for check in found.checks)
 
 
-def test_the_rate_is_what_the_line_carries(generic):
+def test_the_rate_is_limited_by_the_line(generic):
     for takes_s, period_s in ((0.001, 0.010), (0.0098, 0.010), (0.0099, 0.01089), (0.020, 0.022)):
         drive = drive_on(Bank(takes_s=takes_s), generic)
         drive.connect()
@@ -403,7 +403,7 @@ def test_a_line_too_slow_for_the_watchdog(generic):
 
 
 def test_quick_stop_as_a_time(bank, generic):
-    """1 rad/s² from 3000 rpm (314.16 rad/s) down is 314.1 s, in counts of 0.1 s and not longer."""
+    """1 rad/s² from 3000 rpm (314.16 rad/s) takes 314.1 s, in counts of 0.1 s, rounded down."""
     profile = changed(generic, quick_stop_deceleration={"set_to": "quick_stop_time", "unit": "s", "times": "top"},
                       rated_speed={"name": "top"}, name_plate=None)
     bank.words[35] = 30000
@@ -447,7 +447,7 @@ def test_a_speed_only_drive(bank, generic):
 
 @pytest.mark.parametrize("late", [3, 1000])
 def test_an_echo_may_be_late_but_not_stay_away(bank, generic, late):
-    """Drives renew what they display at their leisure; one that never shows it is refused, in bounded time."""
+    """Some drives update their display late. A drive that never shows the value is refused in bounded time."""
     clock = SteppedClock()
     shown, since = (0, 0), 0
 
@@ -464,12 +464,12 @@ def test_an_echo_may_be_late_but_not_stay_away(bank, generic, late):
     found = drive.preflight(LIMITS).refused
     assert [check.name for check in found] == ["speed setpoint as received by the drive"] * (late == 1000)
     assert all("Check that this bus is its reference source" in check.next_step for check in found)
-    assert late == 3 or clock.now_s() > (ECHO_POLLS - 1.5) * ECHO_POLL_S   # the drive got its time
+    assert late == 3 or clock.now_s() > (ECHO_POLLS - 1.5) * ECHO_POLL_S   # the drive had enough time
     assert clock.now_s() < 5.0
     assert bank.words[SPEED_SETPOINT] == bank.words[SPEED_SETPOINT + 1] == 0
 
 
-def test_a_setpoint_that_cannot_be_read_back_stays_untested_and_that_is_said(bank, generic):
+def test_a_setpoint_that_cannot_be_read_back_is_reported_as_untested(bank, generic):
     answer = bank.answer
     bank.answer = lambda pdu: (
         bytes((0x83, 2)) if pdu[0] == 3 and int.from_bytes(pdu[1:3], "big") == SPEED_SETPOINT else answer(pdu))
@@ -486,7 +486,7 @@ def test_rig_and_drive_must_agree_on_every_parameter_that_the_rig_states(bank, g
 
 
 def test_a_ramp_up_is_as_steep_as_the_quick_stop_and_no_steeper(bank, generic):
-    """1 rad/s² up to 3000 rpm is 314.16 s, in counts of 0.1 s and not shorter; given back afterwards."""
+    """1 rad/s² up to 3000 rpm takes 314.16 s, in counts of 0.1 s, rounded up. It is restored afterwards."""
     profile = changed(generic, quick_stop_deceleration={"set_to": "ramp_up_time", "unit": "s", "times": "top"},
                       rated_speed={"name": "top"}, name_plate=None)
     bank.words |= {35: 30000, 39: 30}
@@ -507,13 +507,13 @@ OF_LIMIT = {"speed": {36, 37}, "torque": {38}, "quick-stop": {39}}
 
 
 class QuickClock(SteppedClock):
-    """Of a drive that is taken for a real one, without its waits."""
+    """Clock for a drive that tdhil treats as a real one, without waits."""
 
     stepped = False
 
 
 def real(words, **limits):
-    """A drive without the simulator's marker; its preflight, and the bank."""
+    """Return the preflight and the bank of a drive without the simulator's marker."""
     bank = Bank(marker=False)
     bank.words |= words
     drive = drive_on(bank, load_modbus_profile("generic/modbus"), clock=QuickClock())
@@ -542,7 +542,7 @@ def test_a_limit_is_widened_by_name_no_other_with_it_and_given_back(limit):
     assert {at: bank.words[at] for at in TIGHT} == TIGHT
 
 
-def test_wider_limits_are_tightened_unasked_and_both_values_are_told():
+def test_wider_limits_are_tightened_without_a_request_and_both_values_are_reported():
     found, bank, _ = real({39: 1})
     rows = {check.name: check for check in found.checks}
     assert rows["highest torque"].found == "0.375 of rated torque (was 2 of rated torque)"
@@ -550,7 +550,7 @@ def test_wider_limits_are_tightened_unasked_and_both_values_are_told():
     assert found.kept_torque_nm is None and bank.words[38] == 375
 
 
-def test_a_quick_stop_told_as_a_time_is_wider_where_it_is_longer():
+def test_a_quick_stop_given_as_a_time_is_wider_if_it_is_longer():
     for counts, kept in ((100, True), (60000, False)):
         profile = changed(load_modbus_profile("generic/modbus"), quick_stop_deceleration={
             "set_to": "quick_stop_time", "unit": "s", "per_lsb": 0.001})
@@ -571,11 +571,11 @@ def test_a_simulated_drive_keeps_its_limits_alike():
     assert bank.words[38] == TIGHT[38] != 375
 
 
-# -- what must hold, line by line ------------------------------------------------------------------------------
+# -- further requirements ---------------------------------------------------------------------------------
 
 
 def test_a_watchdog_that_falls_back_to_zero_is_not_armed(bank, generic):
-    """It reads back as it was written, and as 0, which is off, from then on: equal to itself, but not armed."""
+    """It reads back as written, and then as 0, which is off. The later value is stable, but not armed."""
     answer, reads = bank.answer, []
 
     def forgets(pdu):
@@ -591,7 +591,7 @@ def test_a_watchdog_that_falls_back_to_zero_is_not_armed(bank, generic):
 
 
 def test_the_setpoints_are_zero_again_before_anything_else_is_tried(bank, generic):
-    """The mode is written next: nothing of the test values may stand there."""
+    """The mode is written next. No test value may remain then."""
     stood = []
 
     def on_write(address, words):

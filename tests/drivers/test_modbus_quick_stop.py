@@ -1,4 +1,4 @@
-"""`drivers.modbus.quick_stop` against simulated drives that somebody has left turning, judged on the true shaft."""
+"""`drivers.modbus.quick_stop` on simulated drives that turn without a host; checks of the true shaft."""
 
 import csv
 import json
@@ -26,7 +26,7 @@ FAST_RAD_S = 4.0
 
 
 class Left:
-    """A drive in motion that nobody talks to any more."""
+    """Drive in motion without a master."""
 
     def __init__(self, profile, mode, folder):
         self.trace = folder / "shaft.csv"
@@ -65,15 +65,15 @@ def test_it_brakes_to_rest_and_never_lets_go(profile, mode, tmp_path):
     after = [row for row in left.rows() if row[0] >= began_s]
     assert abs(after[0][1]) > 2.0
     free = {"switch on disabled", "ready to switch on", "switched on", "fault"}
-    assert not [row for row in after if row[2] in free and abs(row[1]) > 0.1], "a turning shaft was let go"
+    assert not [row for row in after if row[2] in free and abs(row[1]) > 0.1], "a turning shaft was disabled"
     assert abs(after[-1][1]) < 0.05 and left.clock.now_s() - began_s < 15.0
     said = any("speed mode at zero" in remark for remark in report.remarks)
     needed = profile.modes.torque and not profile.quick_stop.decelerates_in_torque_mode
-    unknown = profile.modes.display is None            # then it is asked for in any case
+    unknown = profile.modes.display is None            # then it is requested in any case
     assert said is (needed and (unknown or mode is Mode.TORQUE))
 
 
-def test_a_drive_that_stays_in_torque_mode_gets_its_quick_stop_and_that_is_said(tmp_path):
+def test_a_drive_that_stays_in_torque_mode_gets_its_quick_stop_and_a_message(tmp_path):
     profile = next(one for one in MODBUS if one.name == "siemens/g120")
     left = Left(profile, Mode.TORQUE, tmp_path)
     left.simulated.machine.application.keeps_mode = True
@@ -94,7 +94,7 @@ def test_a_drive_that_shows_a_state_nobody_knows_is_asked_all_the_same():
 
 @pytest.mark.parametrize(("counts", "near"), [(4000, False), (60, False), (47, True), (-47, True), (0, True)])
 def test_a_speed_in_known_units_is_near_zero_below_0_05_rad_s(counts, near):
-    """A count of the plain profile is 0.01 rpm."""
+    """A count of the unchanged profile is 0.01 rpm."""
     bank, clock = Bank(), SteppedClock()
     bank.feedback = lambda: (counts, 0)
     target = ModbusTarget(EmbeddedLink(bank.serve, clock), load_profile("generic/modbus"), unit=1)
@@ -102,7 +102,7 @@ def test_a_speed_in_known_units_is_near_zero_below_0_05_rad_s(counts, near):
 
 
 def test_a_fault_reaction_has_power_and_is_braked_on():
-    """Its quick-stop word is repeated while the shaft turns: the drive's watchdog might release it."""
+    """The quick-stop word is repeated while the shaft turns, because the watchdog of the drive might disable it."""
     bank, clock = Bank(), SteppedClock()
     bank.feedback = lambda: (3000, 0)
     bank.on_show = lambda words: words.update({STATUS: 0x021F})

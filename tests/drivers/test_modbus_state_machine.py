@@ -1,4 +1,4 @@
-"""Status word in, control word out: the generic profile against the standard's own table, typed in power_machine."""
+"""Control words for status words: the generic profile against the standard's table, typed in power_machine."""
 
 import itertools
 
@@ -45,7 +45,7 @@ def walk(machine, wish, cycles=10, turning=False):
     return [state for state, _ in itertools.groupby(states)]
 
 
-def test_the_way_in_and_out():
+def test_enable_and_disable():
     machine = PowerMachine()
     assert walk(machine, PowerRequest.ENABLED) == [OFF, READY, ON, ENABLED]
     assert walk(machine, PowerRequest.QUICK_STOP) == [ENABLED, STOPPING]
@@ -54,7 +54,7 @@ def test_the_way_in_and_out():
 
 
 @pytest.mark.parametrize("wish", list(PowerRequest))
-def test_no_wish_resets_a_fault(wish):
+def test_no_request_resets_a_fault(wish):
     machine = PowerMachine(FAULT)
     assert walk(machine, wish) == [FAULT]
 
@@ -68,12 +68,12 @@ def test_a_turning_shaft_is_braked_not_disabled(state):
 
 @pytest.mark.parametrize("wish", list(PowerRequest))
 def test_a_fault_reaction_that_brakes_is_never_switched_off(wish):
-    """CiA 402-2: the power stage is on in fault reaction active, and brakes the shaft."""
+    """The power stage is on in fault reaction active and brakes the shaft (CiA 402-2)."""
     state = decode(CONTROL, 0x021F)
     assert controlword_towards(CONTROL, state, wish, Mode.SPEED, turning=True) == CONTROL.quick_stop
 
 
-def test_bits_of_the_mode_and_the_direction_stand_in_every_word():
+def test_bits_of_the_mode_and_the_direction_are_in_every_word():
     control = CONTROL.model_copy(update={"speed_bits": 0x0400, "torque_bits": 0x0C00, "reverse_bits": 0x2000})
     for state, wish in itertools.product((None, *control.states), PowerRequest):
         plain = controlword_towards(CONTROL, state, wish, Mode.SPEED)

@@ -1,4 +1,4 @@
-"""Temperatures that a Modbus drive tells: what is watched, what is refused, and what is said where nobody watches."""
+"""Temperatures that a Modbus drive reports: monitoring, refusals, and the note without monitoring."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def test_a_number_beyond_its_limit_stops_the_run_once(entry, limit_c, hot, words
     cycles(drive)
     bank.words[54] = hot
     with pytest.raises(LimitHit) as caught:
-        cycles(drive, 50)                  # within 2 s and a little
+        cycles(drive, 50)                  # within a little more than 2 s
     assert all(word in str(caught.value) for word in words)
     drive.quick_stop()
     cycles(drive)
@@ -68,13 +68,13 @@ def test_too_hot_already_is_refused():
     assert check.found == "120 °C" and check.wanted == "at most 110 °C"
 
 
-def test_a_limit_that_nothing_would_hold_is_refused():
+def test_a_limit_without_monitoring_is_refused():
     _, _, found = ready([BITS], 110.0)
     assert [check.where for check in found.refused] == ["limits.temperature_c"]
 
 
 @pytest.mark.parametrize("temperatures", [[], [CELSIUS]])
-def test_where_nobody_watches_that_is_said(temperatures):
+def test_without_monitoring_there_is_a_note(temperatures):
     _, _, found = ready(temperatures)
     assert not found.refused
     assert [check for check in found.checks if check.outcome is Outcome.NOTE and "not monitored" in check.found]

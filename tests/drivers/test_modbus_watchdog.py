@@ -1,4 +1,4 @@
-"""Who feeds a Modbus watchdog: a drive that any client keeps running is no answer to a dead host, and taken by name."""
+"""Feeding of a Modbus watchdog: a watchdog that any client feeds is refused without an override."""
 
 import struct
 from dataclasses import replace
@@ -25,7 +25,7 @@ OURS = [("control_word", "verified"), ("writes", "likely"), ("requests_of_this_c
 
 
 class QuickClock(SteppedClock):
-    """Of a drive that is taken for a real one, without its waits."""
+    """Clock for a drive that tdhil treats as a real one, without waits."""
 
     stepped = False
 
@@ -58,30 +58,30 @@ def test_any_client_feeds_it_and_that_is_refused(what, sure):
 
 
 @pytest.mark.parametrize(("what", "sure"), SHARED)
-def test_taken_by_name(what, sure):
+def test_accepted_by_override(what, sure):
     found = preflight(fed_by(what, sure), BY_NAME)
     assert not found.refused and found.fed_by_any_client and found.watched
     assert row(found).outcome is Outcome.NOTE and FLAG in row(found).found
 
 
 @pytest.mark.parametrize(("what", "sure"), OURS)
-def test_what_a_reader_does_not_feed_is_taken_as_it_is(what, sure):
+def test_a_watchdog_that_readers_do_not_feed_is_accepted(what, sure):
     found = preflight(fed_by(what, sure))
     assert not found.refused and not found.fed_by_any_client
 
 
-def test_another_acceptance_does_not_take_it():
+def test_another_override_does_not_accept_it():
     assert preflight(fed_by("any_request"), replace(LIMITS, accept_no_watchdog=True)).refused
 
 
-def test_a_simulated_drive_says_it_and_asks_for_nothing():
+def test_a_simulated_drive_reports_it_and_needs_no_override():
     found = preflight(fed_by("any_request"), bank=Bank())
     assert not found.refused and found.fed_by_any_client
     assert "any request" in row(found).found and row(found).outcome is Outcome.NOTE
 
 
 class Counting(Bank):
-    """Counts requests as function 8 and register 55 tell; ``others`` of another client come with each of ours."""
+    """Bank that counts requests for function 8 and register 55. Each request comes with ``others`` foreign ones."""
 
     def __init__(self, others, diagnostics=True):
         super().__init__(marker=False)
@@ -110,7 +110,7 @@ def test_a_drive_that_counts_shows_another_client(by, others):
 
 
 def test_counting_keeps_the_armed_watchdog_fed():
-    """It is armed already while the drive is asked: never a pause that is as long as its time."""
+    """It is armed during the count, so no pause between requests is as long as its time."""
     bank, times = Counting(0), []
     clock = QuickClock()
     serve = bank.serve

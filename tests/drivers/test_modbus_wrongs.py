@@ -1,7 +1,7 @@
-"""Driver and simulator, each with its own arithmetic: whatever is wired wrong is caught before the shaft could move.
+"""Driver and simulator with separate conversions: each error in their agreement is found before motion.
 
-Once the drive is wrong and the profile right, and once the other way: the simulated drive then wears the profile that
-ships, and the driver reads one with a mistake in it.
+In one case the drive is wrong and the profile right. In the other, the simulated drive uses the shipped profile
+and the driver reads a profile with an error.
 """
 
 import pytest
@@ -17,7 +17,7 @@ from tests.drivers.modbus_bench import driven
 
 LIMITS = DriveLimits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5,
-    accept_wider=frozenset({"torque", "speed", "quick-stop"}),         # or a register that reads tighter is let be
+    accept_wider=frozenset({"torque", "speed", "quick-stop"}),         # or a tighter register is left unchanged
 )
 PROFILE = load_modbus_profile("generic/modbus")
 READ_BACK = [f"reads_back_something_else:{name}" for name in (
@@ -45,7 +45,7 @@ def refused(*wrongs, worn=PROFILE, read=PROFILE):
         simulated.close()
 
 
-def test_none_where_nothing_is_wrong():
+def test_no_refusal_without_an_error():
     assert refused() == ()
 
 
@@ -57,7 +57,7 @@ def test_each_wrong_is_refused(wrong):
 
 
 def mistaken(profile, setpoint, change):
-    """The profile with one number of one setpoint changed."""
+    """Return the profile with one changed number of one setpoint."""
     signal = getattr(profile.cycle, f"{setpoint}_setpoint").model_copy(update=change)
     cycle = profile.cycle.model_copy(update={f"{setpoint}_setpoint": signal})
     return profile.model_copy(update={"cycle": cycle})
@@ -66,7 +66,7 @@ def mistaken(profile, setpoint, change):
 @pytest.mark.heavy(but_first=16)
 @pytest.mark.parametrize("factor", [0.1, 0.5, 2.0, 10.0])
 @pytest.mark.parametrize(("name", "setpoint"), SHOWN)
-def test_a_profile_that_mistakes_what_a_count_of_a_setpoint_is(name, setpoint, factor):
+def test_a_profile_with_a_wrong_count_of_a_setpoint(name, setpoint, factor):
     profile = load_modbus_profile(name)
     entry = getattr(profile.cycle, f"{setpoint}_setpoint")
     wrong = mistaken(profile, setpoint, {"per_lsb": factor * entry.per_lsb})
@@ -76,7 +76,7 @@ def test_a_profile_that_mistakes_what_a_count_of_a_setpoint_is(name, setpoint, f
 
 @pytest.mark.parametrize("name", sorted({name for name, _ in SHOWN}))
 def test_a_profile_that_mixes_up_what_an_echo_shows(name):
-    """The mistake may as well be in the echo: the two have to agree."""
+    """The error may also be in the echo: setpoint and echo have to agree."""
     profile = load_modbus_profile(name)
     echoes = tuple(echo.model_copy(update={"per_lsb": 10.0 * echo.per_lsb}) for echo in profile.echoes)
     names = [check.name for check in refused(worn=profile, read=profile.model_copy(update={"echoes": echoes}))]
@@ -85,8 +85,8 @@ def test_a_profile_that_mixes_up_what_an_echo_shows(name):
 
 
 @pytest.mark.parametrize(("speed_rad_s", "coarse"), [(4.0, True), (6.0, False)])
-def test_an_echo_too_coarse_for_the_limits_says_so(speed_rad_s, coarse):
-    """0.1 % of 10000 rpm is 1.05 rad/s: one and a half of it against half of three quarters of the limit."""
+def test_an_echo_too_coarse_for_the_limits_is_reported(speed_rad_s, coarse):
+    """0.1 % of 10000 rpm is 1.05 rad/s. 1.5 counts are compared with half of three quarters of the limit."""
     profile = load_modbus_profile("danfoss/fc302")
     simulated = EmbeddedModbusDrive(RigParams(), profile)
     simulated.machine.parameters.put("maximum_reference", 10_000.0)

@@ -1,4 +1,4 @@
-"""A status word that is no state: zeros, ones, a pattern that nobody defined. Nothing is disabled on it."""
+"""Status word without a valid state: zeros, ones, an undefined pattern. It does not disable the drive."""
 
 import struct
 from dataclasses import replace
@@ -98,7 +98,7 @@ def test_it_may_be_so_again_after_its_boot_up_message(drive, wire, peer):
     assert cycles(drive, wire, 3).state is PowerState.NOT_READY
 
 
-def test_a_look_by_sdo_repeats_the_quick_stop_of_one_that_shows_no_state(bench):
+def test_a_poll_by_sdo_repeats_the_quick_stop_without_a_valid_state(bench):
     run = Run(bench)
     run.turning(2.0)
     store = bench.simulated.simulator.node.store
@@ -111,7 +111,7 @@ def test_a_look_by_sdo_repeats_the_quick_stop_of_one_that_shows_no_state(bench):
     assert words == [0x0002]
 
 
-def test_one_that_shows_no_state_is_refused(wire, peer, profile):
+def test_a_drive_that_shows_no_state_is_refused(wire, peer, profile):
     peer.machine.__class__ = type("Blank", (type(peer.machine),), {"status": property(lambda self: 0xFFFF)})
     drive = CanopenDrive(wire, profile, SteppedClock(), node=1)
     drive.connect()
@@ -125,7 +125,7 @@ def test_one_that_shows_no_state_is_refused(wire, peer, profile):
 
 
 @pytest.mark.parametrize("profile", MODBUS, ids=lambda one: one.name)
-def test_of_every_family_ones_are_no_state_and_zeros_none_after_it_was_enabled(profile):
+def test_in_every_family_ones_are_no_state_and_zeros_none_after_an_enable(profile):
     assert power_state(decode_modbus(profile.control, 0xFFFF)) is PowerState.UNKNOWN
     assert power_state(decode_modbus_after(profile.control, 0xFFFF)) is PowerState.UNKNOWN
     assert power_state(decode_modbus_after(profile.control, 0x0000)) is PowerState.UNKNOWN
@@ -134,7 +134,7 @@ def test_of_every_family_ones_are_no_state_and_zeros_none_after_it_was_enabled(p
 @pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("profile", MODBUS, ids=lambda one: one.name)
 def test_a_good_run_of_every_family_shows_a_valid_state_in_every_cycle(profile):
-    """The simulated drive speaks as its family's manual has it, not as the profile does."""
+    """The simulated drive follows the manual of its family, not the profile."""
     simulated = EmbeddedModbusDrive(QUIET_RIG, profile)
     drive = driven(simulated, profile)
     drive.connect()
@@ -174,7 +174,7 @@ def test_modbus_dead_feedback_shows_no_state_and_nothing_is_disabled_on_it(statu
 
 
 def test_modbus_left_to_its_watchdog_it_is_not_disabled_either():
-    """Reading does not feed this watchdog; a shaft "at rest" may be disabled then, but not on zeros."""
+    """Reading feeds no watchdog. The drive may be disabled at standstill, but not with a state of zeros."""
     run = BankRun().enabled()
     run.bank.on_show = lambda words: words.update({STATUS: 0, SPEED: 0, SPEED + 1: 0})
     run.drive.quick_stop()
@@ -187,7 +187,7 @@ def test_modbus_left_to_its_watchdog_it_is_not_disabled_either():
     assert run.bank.writes == []
 
 
-def test_modbus_a_look_writes_the_quick_stop_of_one_that_shows_no_state():
+def test_modbus_a_poll_writes_the_quick_stop_without_a_valid_state():
     run = BankRun().enabled()
     run.bank.on_show = lambda words: words.update({STATUS: 0})
     run.drive.quick_stop()
@@ -209,7 +209,7 @@ def test_modbus_one_that_shows_no_state_is_refused():
 
 
 @pytest.mark.parametrize("status", [0x0000, 0xFFFF])
-def test_a_stop_from_outside_takes_no_speed_of_a_blank_status_for_rest(status):
+def test_a_stop_from_outside_accepts_no_standstill_with_a_blank_status(status):
     bank, clock = Bank(), SteppedClock()
     bank.machine.state = ENABLED
     bank.on_show = lambda words: words.update({STATUS: status, SPEED: status, SPEED + 1: status})

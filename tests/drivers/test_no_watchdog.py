@@ -1,6 +1,6 @@
-"""A drive without a watchdog, or with one that can't be armed, once the operator has accepted just that by name.
+"""Drive without a watchdog, or with one that cannot be armed, with the operator's override for it.
 
-What is refused without it is `test_preflight`'s, `test_guarding`'s and `test_modbus_preflight`'s concern.
+`test_preflight`, `test_guarding` and `test_modbus_preflight` test the refusals without the override.
 """
 
 import json
@@ -31,7 +31,7 @@ REACTION = 41
 
 
 def assert_taken(found):
-    """Not refused, never silent, and nobody is told that the drive would stop by itself."""
+    """Assert that it is accepted and reported, and that no message promises a stop by the drive."""
     assert found.refused == ()
     assert (found.watched, found.watchdog_s, found.safe_action) == (False, 0.0, "none")
     (said,) = [check for check in found.checks if check.name == "no watchdog"]
@@ -41,14 +41,14 @@ def assert_taken(found):
 
 
 def assert_refused(found, *titles):
-    """The last of the rows says what the flag is for."""
+    """Assert a refusal whose last row states the purpose of the override."""
     assert [check.name for check in found.refused] == list(titles)
     assert "--accept-no-watchdog" in found.refused[-1].next_step
     assert "no watchdog" not in [check.name for check in found.checks]
 
 
-def test_a_drive_that_can_be_armed_is_armed_all_the_same(run):
-    """Of the contract: the operator's word changes nothing on a drive that doesn't need it."""
+def test_a_watchdog_that_can_be_armed_is_armed_with_the_override_too(run):
+    """The override has no effect on a drive that does not need it, as in the contract."""
     run.drive.connect()
     found = run.drive.preflight(replace(run.bench.limits, accept_no_watchdog=True))
     assert found.refused == ()
@@ -74,7 +74,7 @@ def canopen(wire, profile):
 
 @pytest.mark.parametrize("kind", ["none", "heartbeat"])
 def test_a_full_queue_keeps_no_stop_back_where_no_watchdog_acts(wire, peer, profile, kind):
-    """With one armed nothing more is sent: it acts on the silence. Without one the quick stop is all that there is."""
+    """An armed watchdog acts on silence, so no more frames are sent. Without one, only the quick stop remains."""
     none = {"kind": "none", "reaction": "none", "reaction_index": None, "reaction_value": None}
     watchdog = profile.watchdog.model_copy(update=none if kind == "none" else {})
     drive = enabled(wire, profile.model_copy(update={"watchdog": watchdog}), LIMITS)
@@ -97,14 +97,14 @@ def test_a_profile_without_a_watchdog(canopen, peer):
     assert not [entry for entry in peer.writes if entry[0] in (0x1016, 0x6007)]
 
 
-def test_a_profile_without_a_watchdog_that_nobody_accepted(canopen, peer):
+def test_a_profile_without_a_watchdog_and_without_an_override(canopen, peer):
     assert_refused(canopen(replace(LIMITS, accept_no_watchdog=False), kind="none", reaction="none"), "watchdog")
 
 
 @pytest.mark.parametrize("how", ["absent", "refused", "deaf"])
 @pytest.mark.parametrize("reaction_too", [False, True])
 def test_a_consumer_heartbeat_that_cannot_be_armed(canopen, peer, how, reaction_too):
-    """Where nothing is watched, how the drive would react doesn't matter."""
+    """Without supervision, the reaction of the drive does not matter."""
     for key in [(0x1016, 1), (0x6007, 0)][: 1 + reaction_too]:
         if how == "absent":
             del peer.objects[key]
@@ -124,7 +124,7 @@ def test_a_consumer_heartbeat_that_cannot_be_armed(canopen, peer, how, reaction_
     (127, 65535, False), (1, 1, False),
 ])
 def test_a_consumer_that_is_set_otherwise_stays_refused(canopen, peer, node, time_ms, off):
-    """CiA 301: an entry whose node or time is 0 isn't used; any other supervises somebody."""
+    """An entry with node or time 0 is unused; any other entry supervises a node (CiA 301)."""
     peer.objects[0x1016, 1] = (node << 16 | time_ms).to_bytes(4, "little")
     peer.deaf_to.add((0x1016, 1))
     found = canopen()
@@ -135,13 +135,13 @@ def test_a_consumer_that_is_set_otherwise_stays_refused(canopen, peer, node, tim
         assert "with another setting" in found.refused[-1].next_step
 
 
-def test_a_watchdog_that_is_armed_and_does_something_else_stays_refused(canopen, peer):
+def test_an_armed_watchdog_with_another_reaction_stays_refused(canopen, peer):
     peer.deaf_to.add((0x6007, 0))
     assert_refused(canopen(), "watchdog reaction")
 
 
-def test_a_time_that_can_not_be_is_refused_as_ever(canopen, peer):
-    """A mistake in rig.yaml is no property of the drive."""
+def test_an_impossible_time_stays_refused(canopen, peer):
+    """An error in rig.yaml is no property of the drive."""
     found = canopen(replace(LIMITS, watchdog_s=0.005))
     assert [check.name for check in found.refused] == ["watchdog time"]
     assert peer.value(0x1016, 1) == 0
@@ -160,14 +160,14 @@ def guarded(open_bench):
 
 @pytest.mark.parametrize("how", ["no answer", "no object"])
 def test_node_guarding_that_does_not_work(guarded, how):
-    """A guard time that was written already is taken back: else it stops the shaft some time later, unasked."""
+    """A guard time that is already written is restored. Otherwise it would stop the shaft later."""
     bus, store = guarded.bench.bus, guarded.bench.simulated.simulator.node.store
     asked = []
 
     def change(message):
         if message.arbitration_id != 0x701:
             return [message]
-        asked.append(message)                               # the drive answers; it arrives or not
+        asked.append(message)                               # the drive replies; the reply arrives or not
         return [] if how == "no answer" else [message]
 
     bus.change = change
@@ -180,9 +180,9 @@ def test_node_guarding_that_does_not_work(guarded, how):
     assert before == (how == "no answer")
     guarded.enable(Mode.SPEED)
     guarded.go(2.0, speed=2.0)                              # nothing trips, on either side
-    guarded.drive.quick_stop()                              # and the host's own stop works
+    guarded.drive.quick_stop()                              # and the stop of the host works
     guarded.until(guarded.rests, 5.0)
-    assert len(asked) == before                             # and it isn't asked any more
+    assert len(asked) == before                             # and there are no more requests
 
 
 # -- Modbus -----------------------------------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def modbus(generic):
 
 
 @pytest.mark.parametrize("watchdog", [NONE, {"parameter": None}], ids=["none", "nowhere"])
-def test_a_profile_that_knows_no_time_out(modbus, watchdog):
+def test_a_profile_without_a_time_out(modbus, watchdog):
     assert_taken(modbus(Bank(), watchdog=watchdog))
     assert_refused(modbus(Bank(), replace(LIMITS, accept_no_watchdog=False), watchdog=watchdog), "watchdog")
 
@@ -258,7 +258,7 @@ def test_a_reaction_that_is_wrong_stays_refused_where_the_time_can_be_set(modbus
 
 @pytest.mark.parametrize(("counts", "taken"), [(0, True), (40, False), (501, False), (60_000, False)])
 def test_a_time_out_that_is_set_by_hand(modbus, counts, taken):
-    """So it is where the drive's checklist asks for it too: off is one thing, otherwise another."""
+    """The same applies if the checklist of the drive asks for it: off can be accepted, another value cannot."""
     for require in ({}, {"require": {"at_least": 0.05}}):
         bank = Bank()
         bank.words[TIME_OUT] = counts
@@ -272,7 +272,7 @@ def test_a_time_out_that_is_set_by_hand(modbus, counts, taken):
 
 @pytest.mark.parametrize(("given", "taken"), [({"time_out": 0.0}, True), ({"time_out": 3.0}, False), ({}, False)])
 def test_a_time_out_that_no_register_shows(modbus, given, taken):
-    """What nobody has stated isn't known to be off; on some drives it is on when they leave the factory."""
+    """Without a statement the time-out may be on, as by default on some drives."""
     unseen = {"register": None, "set_to": None, "require": {"at_least": 0.05}}
     found = modbus(Bank(), given=given, time_out=unseen)
     if taken:
@@ -281,7 +281,7 @@ def test_a_time_out_that_no_register_shows(modbus, given, taken):
         assert found.refused
 
 
-def test_a_line_too_slow_is_refused_as_ever(modbus):
+def test_a_line_too_slow_stays_refused(modbus):
     bank = Bank(takes_s=0.1)
     deaf(bank)
     assert [check.name for check in modbus(bank).refused] == ["watchdog time"]

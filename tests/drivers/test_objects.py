@@ -1,4 +1,4 @@
-"""The pure codec, against bytes worked out by hand."""
+"""Pure codec, against bytes calculated by hand."""
 
 import math
 
@@ -35,8 +35,8 @@ def test_torque_round_trip(count, lsb, beside):
 
 @relaxed
 @given(st.floats().filter(lambda x: not abs(x) < 3e9))
-def test_what_does_not_fit_is_rejected(value):
-    """NaN and the infinities among them."""
+def test_values_out_of_range_are_rejected(value):
+    """NaN and infinities are rejected too."""
     with pytest.raises(CommandRejected) as caught:
         encode_speed(value, Units(1.0, 1.0))
     assert "60FFh" in caught.value.where
@@ -58,7 +58,7 @@ def test_the_edges(encode, lowest, highest):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_not_a_number_never_becomes_one(value):
+def test_nan_never_becomes_a_count(value):
     for encode in (encode_speed, encode_torque):
         with pytest.raises(CommandRejected, match="not finite"):
             encode(value, PLAIN)

@@ -1,4 +1,4 @@
-"""What another node, master or tool does beside this host, against the scripted drive: told, refused, or raised."""
+"""Actions of another node, master or tool, on the scripted drive: reported, refused, or raised."""
 
 import itertools
 from dataclasses import replace
@@ -45,7 +45,7 @@ def beats(wire, number, every_s, until_s, begin_s=0.0):
 
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 2.5])
 def test_a_number_that_another_node_bears_is_not_taken(make, wire, peer, every_s):
-    """However slow its heartbeat is, up to three seconds; and the next number is taken too."""
+    """Its heartbeat may take up to three seconds. The next node number is in use too."""
     beats(wire, 127, every_s, 60.0, begin_s=0.4)
     beats(wire, 126, 1.0, 60.0)
     found = ready(make(MonotonicClock()))
@@ -57,14 +57,14 @@ def test_a_number_that_another_node_bears_is_not_taken(make, wire, peer, every_s
     assert "127" in row.found
 
 
-def test_the_bus_is_listened_to_for_three_seconds(make, wire, peer, fake_time):
+def test_the_host_listens_to_the_bus_for_three_seconds(make, wire, peer, fake_time):
     begun_s = fake_time.now_s
     ready(make(MonotonicClock()))
     assert fake_time.now_s - begun_s >= 3.0
     assert peer.value(0x1016, 1) >> 16 == 127
 
 
-def test_no_number_is_left(make, wire, peer):
+def test_no_free_number(make, wire, peer):
     for number in range(2, 128):
         wire.put(0x700 + number, b"\x05", 0.5)
     drive = make(MonotonicClock())
@@ -96,7 +96,7 @@ def test_one_that_comes_in_motion_ends_the_run_with_its_second_beat(make, wire):
         go(drive, wire, 0.1)
 
 
-def test_beats_of_other_nodes_are_nobodys_business(make, wire):
+def test_heartbeats_of_other_nodes_are_ignored(make, wire):
     drive = make()
     ready(drive)
     drive.enable(Mode.SPEED)
@@ -146,17 +146,17 @@ def test_a_quick_stop_option_that_the_profile_does_not_set_is_read_back_and_rest
     assert peer.value(0x605A) == 2
 
 
-def test_the_watchdog_and_what_a_stop_rests_on_are_asked_for_every_other_second(running, wire):
+def test_the_watchdog_and_the_objects_of_the_stop_are_read_every_other_second(running, wire):
     wire.sent.clear()
     go(running, wire, 20.0)
     asked = [data[1:4].hex() for data in wire.of(0x601)]
     assert 39 <= len(asked) <= 41
     assert sum(asked.count(one) for one in ("161001", "076000", "5a6000")) >= 13
     assert sum(one[2:4] not in ("18", "1a") for one in asked) >= 26
-    assert {data[0] for data in wire.of(0x601)} == {0x40}         # reads, and nothing is waited for
+    assert {data[0] for data in wire.of(0x601)} == {0x40}         # reads without a wait
 
 
-def test_a_tool_that_is_heard_writing_makes_that_object_the_next(running, wire, peer):
+def test_an_object_that_a_tool_writes_is_read_back_next(running, wire, peer):
     peer.objects[0x6085, 0] = u(1, 4)
     wire.put(0x601, bytes.fromhex("2385600001000000"))
     with pytest.raises(CommunicationLost, match="191"):
@@ -164,7 +164,7 @@ def test_a_tool_that_is_heard_writing_makes_that_object_the_next(running, wire, 
     assert any("6085h = 1h" in line for line in running.remarks())
 
 
-def test_a_value_that_differs_once_is_asked_for_again(running, wire, peer):
+def test_a_value_that_differs_once_is_read_again(running, wire, peer):
     good = peer.objects[0x6072, 0]
     asked = []
 
@@ -179,7 +179,7 @@ def test_a_value_that_differs_once_is_asked_for_again(running, wire, peer):
 
 
 @pytest.mark.heavy
-def test_a_drive_that_answers_no_sdo_from_the_beginning_runs_on_and_that_is_told(make, wire, peer):
+def test_a_drive_that_never_replies_to_sdo_runs_on_with_a_report(make, wire, peer):
     drive = make()
     ready(drive)
     wire.on_send = lambda identifier, data: None if identifier == 0x601 else peer.on_frame(identifier, data)
@@ -189,7 +189,7 @@ def test_a_drive_that_answers_no_sdo_from_the_beginning_runs_on_and_that_is_told
     assert "were not read back" in line
 
 
-def test_one_that_has_answered_and_falls_silent_for_good_is_lost(running, wire, peer):
+def test_a_drive_that_stops_replying_for_good_is_lost(running, wire, peer):
     wire.on_send = lambda identifier, data: None if identifier == 0x601 else peer.on_frame(identifier, data)
     go(running, wire, 5.0)
     with pytest.raises(CommunicationLost, match="in a row"):
@@ -211,7 +211,7 @@ def test_one_that_refuses_an_object_in_motion_is_not_asked_for_it_any_more(runni
 
 
 def echo(peer):
-    """The drive shows in 60FFh what it was last sent."""
+    """Make the drive show the last setpoint in 60FFh."""
 
     def before(request):
         _, _, speed = peer.setpoints[-1]
@@ -235,14 +235,14 @@ def test_a_drive_that_does_not_show_its_setpoint_is_not_judged_by_it(running, wi
     go(running, wire, 30.0, speed=1.0)
 
 
-def test_a_setpoint_that_changes_in_every_cycle_is_ours(running, wire, peer):
+def test_a_setpoint_that_changes_in_every_cycle_is_not_foreign(running, wire, peer):
     echo(peer)
     for k in range(5000):
         go(running, wire, running.period_s, speed=1.0 + 0.01 * (k % 97))
 
 
 @pytest.mark.parametrize("identifier", [0x201, 0x301, 0x401, 0x501])
-def test_setpoints_of_somebody_else_end_the_run_with_the_second(running, wire, identifier):
+def test_the_second_foreign_setpoint_ends_the_run(running, wire, identifier):
     wire.put(identifier, bytes(8))
     go(running, wire, 2.0)
     assert any(f"{identifier:03X}h" in line for line in running.remarks())
@@ -251,7 +251,7 @@ def test_setpoints_of_somebody_else_end_the_run_with_the_second(running, wire, i
         go(running, wire, 0.1)
 
 
-def test_stray_writes_are_told_and_a_third_is_a_second_master(running, wire):
+def test_two_foreign_writes_are_reported_and_a_third_shows_another_master(running, wire):
     wire.put(0x601, bytes.fromhex("2b40600006000000"))
     go(running, wire, 1.0)
     wire.put(0x601, bytes.fromhex("2f60600004000000"))
@@ -272,7 +272,7 @@ def test_a_tool_that_only_reads_is_no_trouble(running, wire):
     assert running.remarks() == running.summary() == ()
 
 
-# -- RPDOs that aren't ours ----------------------------------------------------------------------------------------
+# -- RPDOs of others --------------------------------------------------------------------------------------------
 
 
 def more_rpdos(peer, **identifiers):
@@ -294,7 +294,7 @@ def test_other_rpdos_are_switched_off_and_given_back(make, peer):
     assert [peer.value(0x1400 + n - 1, 1) for n in (3, 4, 8, 9)] == [0x401, 0x80000501, 0x123, 0x40000124]
 
 
-def test_one_that_stays_on_is_refused(make, peer):
+def test_an_rpdo_that_stays_enabled_is_refused(make, peer):
     more_rpdos(peer, n3=0x401)
     peer.deaf_to.add((0x1402, 1))
     drive = make()
@@ -304,7 +304,7 @@ def test_one_that_stays_on_is_refused(make, peer):
     assert "stays on" in row.found
 
 
-def test_its_frames_are_known_by_their_own_identifier(make, wire, peer):
+def test_its_frames_are_found_by_their_identifier(make, wire, peer):
     more_rpdos(peer, n5=0x123)
     drive = make()
     ready(drive)
@@ -349,20 +349,20 @@ def test_a_short_watchdog_is_fed_five_times_in_its_time(wire, peer, profile, fak
     assert max(gaps) <= min(0.1, watchdog_s / 5.0) + 2 * drive.period_s
 
 
-def test_after_stop_feeding_nothing_goes_out_that_the_watchdog_hears(running, wire):
+def test_after_stop_feeding_no_frame_feeds_the_watchdog(running, wire):
     running.quick_stop()
     go(running, wire, 0.2)
     running.stop_feeding()
     running.stop_feeding()
     wire.sent.clear()
     sample = go(running, wire, 2.0)
-    assert sample.fresh                            # in stepped time the SYNC goes on, and with it the feedback
+    assert sample.fresh                            # in stepped time SYNC and feedback continue
     assert {identifier for identifier, _ in wire.sent} == {0x080}
     running.poll()
     assert not wire.of(0x77F)
 
 
-def test_in_real_time_not_even_the_sync_goes_out(make, wire, peer):
+def test_in_real_time_not_even_the_sync_is_sent(make, wire, peer):
     drive = make(MonotonicClock())
     ready(drive)
     drive.enable(Mode.SPEED)
@@ -377,15 +377,15 @@ def test_in_real_time_not_even_the_sync_goes_out(make, wire, peer):
     assert {identifier for identifier, _ in wire.sent} == {0x601}
 
 
-# -- a quick stop that is undone ---------------------------------------------------------------------------------------
+# -- a quick stop that is reversed -----------------------------------------------------------------------------------
 
 
 def undo(wire, peer):
-    """Another master takes the drive out of its quick stop after each of our frames, through RPDO1."""
+    """Let another master reverse the quick stop after each frame of the host, through RPDO1."""
     def before_sync(identifier, data):
         if identifier == 0x080 and not peer.value(0x1400, 1) >> 31:
             peer.on_frame(0x201, bytes.fromhex("0f00") + bytes(6))
-        if peer.value(0x1400, 1) >> 31:            # an RPDO that is off acts no more
+        if peer.value(0x1400, 1) >> 31:            # a disabled RPDO has no effect
             peer._latched = (peer.machine.word, 0, 0)
             if identifier == 0x201:
                 return
@@ -394,7 +394,7 @@ def undo(wire, peer):
     wire.on_send = before_sync
 
 
-def test_a_quick_stop_that_is_undone_is_made_to_stand(running, wire, peer):
+def test_a_quick_stop_that_is_reversed_is_enforced(running, wire, peer):
     undo(wire, peer)
     running.quick_stop()
     go(running, wire, 1.0)
@@ -406,10 +406,10 @@ def test_a_quick_stop_that_is_undone_is_made_to_stand(running, wire, peer):
     go(running, wire, 0.5)
     assert peer.machine.state == "switch on disabled"
     running.close()
-    assert peer.value(0x1400, 1) == 0x80000201        # as it was found
+    assert peer.value(0x1400, 1) == 0x80000201        # as found
 
 
-def test_one_that_stands_is_left_as_it_is(running, wire, peer):
+def test_a_quick_stop_that_is_kept_changes_no_rpdo(running, wire, peer):
     running.quick_stop()
     go(running, wire, 2.0)
     assert not peer.value(0x1400, 1) >> 31

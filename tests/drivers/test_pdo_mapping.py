@@ -49,14 +49,14 @@ def test_identifiers_of_the_predefined_connection_set(node, identifiers):
     assert [pdo.identifier(node) for pdo in layout(Slow(demand=True))] == identifiers
 
 
-def test_a_fixed_mapping_that_says_no(objects, peer):
+def test_a_fixed_mapping_that_differs(objects, peer):
     peer.refuse_write[0x1600, 0] = 0x06010002
     with pytest.raises(ObjectRefused) as caught:
         write_pdo(objects, 1, layout(Slow(demand=True))[0])
     assert caught.value.where == "1600h"
 
 
-def test_a_fixed_mapping_that_says_yes(objects, peer):
+def test_a_fixed_mapping_that_agrees(objects, peer):
     peer.deaf_to |= {(0x1600, sub) for sub in range(9)}
     with pytest.raises(PreflightRefused, match="60400010h") as caught:
         write_pdo(objects, 1, layout(Slow(demand=True))[0])
@@ -65,8 +65,8 @@ def test_a_fixed_mapping_that_says_yes(objects, peer):
 
 
 @pytest.mark.parametrize("sub", [1, 2])
-def test_a_communication_parameter_that_is_not_taken_over(objects, peer, sub):
-    """A PDO that stays disabled, or does not follow the SYNC, is as bad as one of the wrong content."""
+def test_a_communication_parameter_that_is_not_stored(objects, peer, sub):
+    """A PDO that stays disabled or does not follow the SYNC is refused like one with the wrong content."""
     peer.deaf_to.add((0x1800, sub))
     with pytest.raises(PreflightRefused) as caught:
         write_pdo(objects, 1, layout(Slow(demand=True))[1])

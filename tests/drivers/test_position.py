@@ -1,4 +1,4 @@
-"""`Positioned`: the angle that the drives tell, against the true shaft's of the simulators."""
+"""`Positioned`: the reported angle, compared with the true angle of the simulated shaft."""
 
 import itertools
 import math
@@ -41,7 +41,7 @@ def test_it_follows_the_true_shaft(run):
     ])
 
 
-def test_it_costs_no_cycle(run):
+def test_it_takes_no_cycle(run):
     run.ready()
     run.enable(Mode.SPEED)
     before = run.drive.counters
@@ -53,7 +53,7 @@ def test_it_costs_no_cycle(run):
     assert (after.missed, after.overruns) == (before.missed, before.overruns)
 
 
-def test_a_drive_that_does_not_answer_gives_none(run):
+def test_a_drive_that_does_not_reply_gives_none(run):
     run.ready()
     run.enable(Mode.SPEED)
     if isinstance(run.bench, CanopenBench):

@@ -1,4 +1,4 @@
-"""What is refused before anything moves. Each row by itself, and never one row at the cost of those after it."""
+"""Refusals before motion: each row alone. A refused row does not prevent the checks after it."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def changed(profile, section, **values):
     return profile.model_copy(update={section: getattr(profile, section).model_copy(update=values)})
 
 
-def test_a_drive_as_it_should_be(make, peer):
+def test_a_right_drive_passes(make, peer):
     found = preflight(make())
     assert [check.name for check in found.checks] == ROWS
     assert found.refused == ()
@@ -51,10 +51,10 @@ def test_a_drive_as_it_should_be(make, peer):
     assert peer.operational
 
 
-def test_what_then_stands_in_the_drive(make, peer):
+def test_values_in_the_drive_after_preflight(make, peer):
     preflight(make())
     assert peer.value(0x6072) == 300                     # ‰ of 1000 N·m
-    assert peer.value(0x6080) == 96                      # 10 rad/s = 95.49 rpm, the next one up
+    assert peer.value(0x6080) == 96                      # 10 rad/s = 95.49 rpm, rounded up
     assert peer.value(0x6085) == 191                     # 2 rad/s² = 190.99 · 0.1 rpm/s
     assert peer.value(0x605A) == 6
     assert peer.value(0x6007) == 3
@@ -70,7 +70,7 @@ def test_what_then_stands_in_the_drive(make, peer):
     (None, None, 6, True), (None, None, None, None), (None, "quick_stop", None, True), (None, "off", None, False),
 ])
 def test_whether_a_quick_stop_holds_the_shaft(make, peer, profile, option, ends, there, holds):
-    """CiA 402-2, 605Ah: 5 to 8 stay in quick stop active. Without the object the profile's own word counts."""
+    """Options 5 to 8 of 605Ah stay in quick stop active (CiA 402-2). Without the object the profile decides."""
     if there is None:
         del peer.objects[(0x605A, 0)]
     else:
@@ -88,8 +88,8 @@ def without_option(profile):
 
 
 @pytest.mark.parametrize("option", [None, 6])
-def test_a_quick_stop_that_coasts_is_refused_whatever_the_profile_states(make, peer, profile, option):
-    """605Ah = 0, and a drive that does not take another value where the profile names one."""
+def test_a_quick_stop_that_coasts_is_refused_for_any_profile(make, peer, profile, option):
+    """605Ah is 0, and the drive does not accept the value that the profile names."""
     peer.objects[(0x605A, 0)] = u(0, 2)
     peer.deaf_to.add((0x605A, 0))
     found = preflight(make(changed=changed(profile, "quick_stop", option_code=option)))
@@ -118,7 +118,7 @@ def test_a_quick_stop_option_that_can_not_be_read_is_named(make, peer, profile):
     assert row.found.startswith("not readable") and "quick stop brakes" in row.next_step
 
 
-def test_nothing_is_switched_on_meanwhile(make, peer, wire):
+def test_preflight_does_not_enable_the_drive(make, peer, wire):
     preflight(make())
     assert peer.machine.state == OFF
     assert not [entry for entry in peer.writes if entry[0] == 0x6040]
@@ -126,7 +126,7 @@ def test_nothing_is_switched_on_meanwhile(make, peer, wire):
 
 
 def test_the_watchdog_is_fed_before_it_is_read_back(make, peer, wire):
-    """Supervision begins with the first heartbeat."""
+    """The supervision of the drive begins with the first heartbeat."""
     preflight(make(host_node=99))
     frames = [(identifier, data.hex()) for identifier, data in wire.sent]
     armed = frames.index((0x601, "2316100190016300"))
@@ -167,7 +167,7 @@ def test_a_fault_at_the_start_is_refused_and_left_alone(make, peer):
 
 
 @pytest.mark.parametrize("before", [0x00, 0x80, 0x8F])
-def test_a_reset_that_was_asked_for_is_an_edge(make, peer, before):
+def test_a_requested_reset_is_an_edge(make, peer, before):
     peer.machine.state, peer.machine.word = FAULT, before
     drive = make()
     drive.connect()
@@ -195,14 +195,14 @@ def test_a_drive_that_still_brakes_after_a_stop_is_left_alone(make, peer, veloci
     peer.objects[0x606C, 0] = velocity.to_bytes(4, "little", signed=True)
     drive = make()
     assert ("state" not in refused(preflight(drive))) == good
-    if not good:                       # neither its mode nor what a quick stop does is changed under way
+    if not good:                       # neither mode nor quick-stop option is changed in motion
         drive.close()
         assert peer.writes == []
         assert peer.machine.state == STOPPING
 
 
 def test_three_coarse_counts_are_no_standstill(make, peer, profile):
-    """A count of 1 rpm: 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
+    """A count is 1 rpm. 3 rpm is 0.31 rad/s, and standstill is at most 0.2 rad/s."""
     peer.machine.state, peer.objects[0x606C, 0] = STOPPING, u(3, 4)
     assert "state" in refused(preflight(make(changed=changed(profile, "speed", rpm_per_lsb=1.0))))
     assert peer.writes == []
@@ -216,7 +216,7 @@ def test_a_fault_reaction_is_left_alone_too(make, peer):
 
 @pytest.mark.parametrize("state", [STOPPING, REACTION, OFF])
 def test_a_drive_that_is_not_in_fault_is_not_reset(make, peer, state):
-    """The edge's low word is 'disable voltage', which lets go of a shaft that brakes or is held."""
+    """The low word of the edge is 'disable voltage', which would release a shaft that brakes or is held."""
     peer.machine.state = state
     drive = make()
     drive.connect()
@@ -281,7 +281,7 @@ LIMIT_OBJECTS = [(0x6072, "torque limit"), (0x6080, "speed limit"), (0x6085, "qu
 
 
 @pytest.mark.parametrize(("index", "row"), LIMIT_OBJECTS)
-def test_accepted_but_not_taken_over(make, peer, index, row):
+def test_acknowledged_but_not_stored(make, peer, index, row):
     peer.deaf_to.add((index, 0))
     found = preflight(make())
     assert list(refused(found)) == [row]
@@ -362,7 +362,7 @@ def test_no_speed_mode(make, peer):
     assert refused(found)["modes of operation"].where == "6502h"
 
 
-def test_a_mode_that_was_not_found_cannot_be_asked_for(make, peer):
+def test_a_mode_that_was_not_found_cannot_be_requested(make, peer):
     peer.objects[0x6502, 0] = bits(3)
     drive = make()
     preflight(drive)
@@ -417,7 +417,7 @@ def test_a_simulated_drive_may_keep_its_own_time(make, peer):
 
 
 @pytest.mark.parametrize(("index", "row"), [(0x1006, "cycle"), (0x1017, "drive's heartbeat")])
-def test_what_a_drive_may_lack(make, peer, index, row):
+def test_objects_that_a_drive_may_lack(make, peer, index, row):
     del peer.objects[index, 0]
     found = preflight(make())
     assert found.refused == ()
@@ -437,14 +437,14 @@ def test_a_drive_with_a_fixed_mapping(make, peer):
     assert refused(found)["PDO mapping"].where == "1A00h"
 
 
-def test_a_temperature_limit_that_nothing_would_hold_is_refused(make, peer):
+def test_a_temperature_limit_without_monitoring_is_refused(make, peer):
     drive = make()
     drive.connect()
     found = drive.preflight(dataclasses.replace(LIMITS, temperature_c=90.0))
     assert [check.where for check in found.refused] == ["limits.temperature_c"]
 
 
-def test_everything_wrong_at_once(make, peer, profile):
+def test_all_errors_at_once(make, peer, profile):
     peer.machine.state = FAULT
     peer.objects[0x6502, 0] = bits(4)
     del peer.objects[0x6076, 0]
@@ -470,7 +470,7 @@ def test_nobody_there(make, peer, step):
     assert "bit rate" in caught.value.next_step
 
 
-def test_what_was_refused_is_given_back_on_close(make, peer):
+def test_settings_of_a_refused_preflight_are_restored_on_close(make, peer):
     before = dict(peer.objects)
     peer.deaf_to.add((0x6061, 0))
     drive = make()
@@ -483,7 +483,7 @@ def test_what_was_refused_is_given_back_on_close(make, peer):
     assert not peer.operational
 
 
-# -- the drive's own limits ----------------------------------------------------------------------------------
+# -- limits of the drive itself ----------------------------------------------------------------------------------
 
 
 TIGHT = {0x6072: 100, 0x6080: 40, 0x6085: 1910}        # 100 N·m, 4.19 rad/s, 20 rad/s²; LIMITS ask 300, 10, 2
@@ -530,14 +530,14 @@ def test_it_is_widened_by_name_and_no_other_with_it(make, tight, limit):
     assert {index: tight.value(index) for index in TIGHT} == TIGHT
 
 
-def test_a_wider_limit_is_tightened_unasked_and_both_values_are_told(make, peer):
+def test_a_wider_limit_is_tightened_without_a_request_and_both_values_are_reported(make, peer):
     rows = {check.name: check for check in preflight(make()).checks}
     assert rows["torque limit"].found == "300 N·m (was 900 N·m)"
     assert rows["torque limit"].outcome is Outcome.OK
 
 
 def test_a_torque_limit_between_two_counts_is_rounded_down(make, peer):
-    """One up would let the drive give more than rig.yaml allows."""
+    """Rounding up would permit more torque than rig.yaml allows."""
     drive = make()
     drive.connect()
     drive.preflight(dataclasses.replace(LIMITS, torque_nm=299.7))

@@ -1,4 +1,4 @@
-"""Preflight against drives that wear real profiles: what is set wrong by hand is refused, with the place to mend it."""
+"""Preflight with real profiles: wrong manual settings are refused, with the place to correct them."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def refused(found):
 
 
 @pytest.mark.parametrize("kind", [Epos4Bench, S120Bench])
-def test_as_delivered_it_is_accepted_and_every_limit_stands_in_the_drive(make, kind):
+def test_with_default_settings_it_is_accepted_and_every_limit_is_in_the_drive(make, kind):
     found = found_with(make(kind))
     assert found.refused == ()
     titles = [check.name for check in found.checks if check.outcome is Outcome.OK]
@@ -66,35 +66,35 @@ def test_rated_torque_is_in_micro_newton_metres(make):
 @pytest.mark.parametrize(("index", "sub", "value", "title", "words"), [
     (0x4228, 0, 1, "p8744 CAN PDO mapping configuration", "p8744 = 2"),
     (0x2803, 1, 0, "p2051[1] the second send word, r0080", "r0080[0]"),
-    (0x2803, 1, 31 << 16, "p2051[1] the second send word, r0080", "r0080[0]"),       # the smoothed one
+    (0x2803, 1, 31 << 16, "p2051[1] the second send word, r0080", "r0080[0]"),       # the smoothed signal
     (0x2198, 0, 0, "unit of speed", "p8630[0]"),
     (0x21A2, 0, 200, "unit of speed", "scaled"),
 ])
-def test_what_must_be_set_by_hand_on_an_s120(make, index, sub, value, title, words):
+def test_manual_settings_of_an_s120(make, index, sub, value, title, words):
     check = refused(found_with(make(S120Bench), index, sub, value))[title]
     assert words in check.next_step
     assert f"{index:04X}h" in check.where
 
 
 def test_an_s120_with_another_encoder_is_scaled_by_it(make):
-    """1024 pulses and 2^9: 524288 counts a turn."""
+    """1024 pulses and 2^9 give 524288 counts per turn."""
     bench = make(S120Bench)
     store = bench.simulated.simulator.node.store
     store.values[0x21A200] = 9
     assert found_with(bench, 0x2198, 0, 1024).speed_resolution_rad_s == pytest.approx(6.283185307 / 524288)
 
 
-def test_the_limits_of_an_s120_read_back_as_they_were_meant(make):
+def test_the_limits_of_an_s120_read_back_as_written(make):
     bench = make(S120Bench)
     found_with(bench)
     # IEEE 754: 300, -300 N·m; 143.2394 rpm is 15 rad/s; 15 s down from there at 1 rad/s²
     assert bench.read(0x6072) == 0x43960000
     assert bench.read(0x25F1) == 0xC3960000
     assert bench.read(0x243A) == 0x430F3D4D
-    assert abs(bench.read(0x246F) - 0x41700000) <= 1       # worked out from a speed that is one of these itself
+    assert abs(bench.read(0x246F) - 0x41700000) <= 1       # calculated from a speed that is one of these
 
 
-def test_a_drive_whose_object_is_missing_says_so(make):
+def test_a_missing_object_is_reported(make):
     bench = make(S120Bench)
     bench.simulated.simulator.node.store.remove(0x5810)
     check = refused(found_with(bench))["PDO mapping"]
@@ -111,7 +111,7 @@ class UnlimitedBench(CanopenBench):
         self.drive._profile = sections.model_copy(update={"torque": torque})
 
 
-def test_where_only_the_host_limits_torque_the_table_says_so(make):
+def test_the_table_states_if_only_the_host_limits_the_torque(make):
     found = found_with(make(UnlimitedBench))
     note = next(check for check in found.checks if check.name == "torque limit")
     assert note.outcome is Outcome.NOTE
@@ -143,9 +143,9 @@ def test_torque_of_32_bits(make, monkeypatch, kind):
     last = run.go(12.0, speed=5.0)
     assert last.torque_nm == pytest.approx(100.0, abs=1.0)
     assert last.speed_rad_s == pytest.approx(5.0, abs=0.01)
-    missed = run.drive.counters.missed                     # none, unless the machine stood still for half a second
+    missed = run.drive.counters.missed                     # none, unless the computer paused for half a second
     assert missed <= 2
-    # Half of a cycle's feedback is none: no torque of one instant beside a state of another.
+    # Half of the feedback of a cycle does not count: torque and state must be of one instant.
     run.bench.bus.change = lambda message: [] if message.arbitration_id == 0x281 else [message]
     assert not run.cycle(speed=5.0).fresh
     run.bench.bus.change = lambda message: [] if message.arbitration_id == 0x181 else [message]
@@ -159,7 +159,7 @@ def test_torque_of_32_bits(make, monkeypatch, kind):
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("kind", [AbbBench, Epos4Bench, S120Bench])
 def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
-    """The S120 counts encoder increments, an ABB in vl shows its speed elsewhere."""
+    """The S120 counts encoder increments. An ABB drive in velocity mode shows its speed in another object."""
     bench = make(kind)
     Run(bench).turning(5.0)
     target = CanopenTarget(bench._second, load_canopen_profile(kind.PROFILE), bench.drive.clock, node=1)
@@ -180,8 +180,8 @@ def test_requirements(require, value, good):
 
 
 @pytest.mark.parametrize("limit_nm", [123.4567, 300.0005, 7.77])
-def test_a_torque_limit_in_counts_is_never_above_what_was_asked(make, limit_nm):
-    """EPOS4: 3001h:02 in mA times 3001h:05, the torque constant in µN·m/A; a count of it is some thousandths."""
+def test_a_torque_limit_in_counts_is_never_above_the_request(make, limit_nm):
+    """The limit of an EPOS4 is 3001h:02 in mA times the torque constant 3001h:05 in µN·m/A, in coarse counts."""
     bench = make(Epos4Bench)
     bench.limits = replace(bench.limits, torque_nm=limit_nm)
     assert refused(found_with(bench)) == {}

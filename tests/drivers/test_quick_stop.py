@@ -1,4 +1,4 @@
-"""`tdhil stop` on a CANopen drive that is in torque mode, where its quick stop lets go of the shaft."""
+"""`tdhil stop` on a CANopen drive in torque mode, where its quick stop coasts."""
 
 from contextlib import suppress
 
@@ -28,7 +28,7 @@ def epos4():
 
 @pytest.fixture
 def turning(epos4, tmp_path):
-    """A light shaft in cyclic torque mode, at more than 2 rad/s, in real time."""
+    """Drive with a light shaft in cyclic torque mode, at more than 2 rad/s, in real time."""
     trace = tmp_path / "shaft.csv"
     params = RigParams(plant=Params(inertia_kg_m2=30.0), noise=QUIET, reporting=FAITHFUL)
     with EmbeddedSimulator(params, profile=epos4, stepped=False, trace=trace) as simulated:
@@ -75,13 +75,13 @@ def test_speed_mode_comes_before_the_quick_stop(wire, scripted, epos4):
     assert order(scripted) == [(0x60FF, 0), (0x6060, 9), (0x6040, 0x02)]
 
 
-def test_a_drive_that_does_not_take_it_gets_the_quick_stop_all_the_same_and_that_is_said(wire, scripted, epos4):
+def test_a_drive_that_refuses_speed_mode_gets_the_quick_stop_and_a_message(wire, scripted, epos4):
     scripted.deaf_to.add((0x6061, 0))
     target = CanopenTarget(wire, epos4, MonotonicClock(), node=1)
     target.ask(1)
     target.ask(2)
     assert order(scripted).count((0x6040, 0x02)) == 2
-    assert order(scripted).count((0x6060, 9)) == 1          # no more time is spent on it
+    assert order(scripted).count((0x6060, 9)) == 1          # no more attempts
     assert any("stays in torque mode" in line for line in target.remarks())
 
 
@@ -162,8 +162,8 @@ def test_a_quick_stop_option_whose_write_is_lost_is_written_again(wire, scripted
 
 
 @pytest.mark.parametrize("name", ["generic/cia402", "maxon/epos4"])
-def test_where_it_is_not_needed_nothing_is_written_but_the_quick_stop(wire, scripted, name):
-    """In speed mode, or where a quick stop decelerates in torque mode too."""
+def test_if_speed_mode_is_not_needed_only_the_quick_stop_is_written(wire, scripted, name):
+    """The drive is in speed mode, or its quick stop decelerates in torque mode too."""
     if name == "maxon/epos4":
         scripted.objects[0x6061, 0] = u(9, 1)
     CanopenTarget(wire, load_canopen_profile(name), MonotonicClock(), node=1).ask(1)
@@ -175,7 +175,7 @@ def target_of(wire, profile="generic/cia402"):
 
 
 @pytest.mark.parametrize("refused", [False, True])
-def test_a_quick_stop_that_is_set_to_coast_is_set_otherwise_or_the_halt_bit_stands_in(wire, scripted, refused):
+def test_a_quick_stop_set_to_coast_is_changed_or_replaced_by_the_halt_bit(wire, scripted, refused):
     scripted.objects[0x605A, 0] = u(0, 2)
     if refused:
         scripted.refuse_write[0x605A, 0] = 0x06010002
@@ -199,8 +199,8 @@ def test_the_halt_bit_enables_no_drive(wire, scripted, state):
     assert scripted.machine.state != "operation enabled"
 
 
-def test_what_undoes_it_gets_it_by_rpdo_too_and_is_switched_off_in_the_end(wire, scripted):
-    """6040h behind a byte of something else in RPDO2; RPDO1 is off, RPDO3 carries no controlword."""
+def test_an_rpdo_that_reverses_it_is_answered_by_rpdo_and_finally_disabled(wire, scripted):
+    """RPDO2 has 6040h after one other byte. RPDO1 is disabled, and RPDO3 has no controlword."""
     scripted.objects |= {
         (0x1401, 1): u(0x301, 4), (0x1601, 0): u(2, 1), (0x1601, 1): u(0x60600008, 4), (0x1601, 2): u(0x60400010, 4),
         (0x1402, 1): u(0x401, 4), (0x1602, 0): u(1, 1), (0x1602, 1): u(0x60FF0020, 4),
@@ -224,7 +224,7 @@ def test_what_undoes_it_gets_it_by_rpdo_too_and_is_switched_off_in_the_end(wire,
         target.ask(BY_SDO_TRIES + 1)
 
 
-def test_what_is_seen_of_the_drive(wire, scripted):
+def test_readings_of_the_drive(wire, scripted):
     scripted.objects[0x606C, 0] = u(500, 4)
     target = target_of(wire)
     seen = target.poll()
@@ -239,7 +239,7 @@ def test_what_is_seen_of_the_drive(wire, scripted):
 
 
 @pytest.mark.parametrize("foreign", [0x080, 0x201, 0x301, 0x401, 0x501, 0x601])
-def test_another_master_is_told(wire, scripted, foreign):
+def test_another_master_is_reported(wire, scripted, foreign):
     target = target_of(wire)
     assert target.remarks() == ()
     wire.put(foreign, b"\x0f\x00")
@@ -250,8 +250,8 @@ def test_another_master_is_told(wire, scripted, foreign):
 
 
 @pytest.mark.parametrize("other_steps", [False, True])
-def test_a_simulated_drive_whose_time_was_stepped_goes_on_by_itself(wire, other_steps):
-    """Unless a host steps it still."""
+def test_a_simulated_drive_in_stepped_time_continues_in_its_own_time(wire, other_steps):
+    """It stays stepped while a host steps it."""
     peer = ScriptedDrive(wire)
     peer.objects[0x605A, 0] = u(6, 2)
     if other_steps:

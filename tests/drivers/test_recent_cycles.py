@@ -1,4 +1,4 @@
-"""Missing feedback of the recent cycles is counted as it comes; the oracle counts all of them anew."""
+"""Count of missing feedback in recent cycles: incremental, compared with a full count."""
 
 import random
 

@@ -8,7 +8,7 @@ from tests.drivers.ethercat_bench import EthercatBench
 from tests.drivers.profile_benches import Epos4Bench, S120Bench
 
 TURN_S = 60.0
-"""Longest time in which each setting has had its turn, s."""
+"""Longest time until each setting has been read back, s."""
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_on_ethercat_too(make):
 
 
 def test_no_further_request_is_sent_for_them(make):
-    """One every half second, as without them; the watchdog and the quick stop keep their share."""
+    """The host sends one request every 0.5 s, as without them. Watchdog and quick stop keep their share."""
     run = make(Epos4Bench)
     run.bench.heard()
     run.go(30.0)

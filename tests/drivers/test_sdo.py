@@ -1,4 +1,4 @@
-"""Objects over a hand-typed SDO server: what is asked, what is refused, what must not be taken for an answer."""
+"""Objects over a hand-typed SDO server: requests, aborts, and frames that are no replies."""
 
 import pytest
 from canopen.sdo import SdoAbortedError
@@ -44,7 +44,7 @@ def test_segmented_upload(objects, peer, length):
 
 @pytest.mark.parametrize("announced", [True, False])
 def test_an_endless_upload_is_aborted_in_little_time(objects, peer, wire, fake_time, announced):
-    """The scripted drive sends segments for ever, each just before the time-out of its request."""
+    """The scripted drive sends endless segments, each just before the time-out of its request."""
     head = bytes.fromhex("41081000ffff0000" if announced else "4008100000000000")
 
     def answer(request):
@@ -60,7 +60,7 @@ def test_an_endless_upload_is_aborted_in_little_time(objects, peer, wire, fake_t
     assert fake_time.now_s - begin_s < (1.0 if announced else LONGEST_UPLOAD_S + 1.0)
     assert wire.of(0x601)[-1].hex() == ("8008100005000405" if announced else "8008100000000405")
     wire.on_send = peer.on_frame
-    assert objects.read(0x1000) == 0x00020192             # the client and the drive go on
+    assert objects.read(0x1000) == 0x00020192             # client and drive continue to work
 
 
 def test_the_time_for_an_upload_is_bounded_in_motion_too(objects, peer, wire, fake_time):
@@ -86,7 +86,7 @@ def test_an_abort_names_object_and_code(objects, peer, code):
         assert f"{code:08X}" in caught.value.what.upper()
 
 
-def test_a_refused_write_tells_the_value(objects, peer):
+def test_a_refused_write_names_the_value(objects, peer):
     peer.refuse_write[0x6072, 0] = 0x06090031
     with pytest.raises(ObjectRefused, match="65000"):
         objects.write(0x6072, 0, 65000, 16)
@@ -99,7 +99,7 @@ def test_a_value_too_large_for_the_object_is_refused_without_a_frame(objects, wi
     assert wire.sent == []
 
 
-def test_absence_is_no_error_where_it_may_be(objects, peer):
+def test_the_absence_of_an_optional_object_is_no_error(objects, peer):
     assert objects.read_if_there(0x6999) is None
     peer.silent = True
     with pytest.raises(CommunicationLost):
@@ -119,7 +119,7 @@ def test_a_silent_node_is_given_up_after_a_bounded_time(objects, peer, wire, fak
     assert "bit rate" in caught.value.next_step
 
 
-def test_one_lost_answer_is_asked_for_again(objects, peer, wire):
+def test_a_lost_reply_is_requested_again(objects, peer, wire):
     lost = [True]
 
     def lose(request):
@@ -132,14 +132,14 @@ def test_one_lost_answer_is_asked_for_again(objects, peer, wire):
 RUBBISH = [
     "", "00", "43", "4300100092010200ff"[:14],          # short
     "ffffffffffffffff", "0000000000000000", "e0e0e0e0e0e0e0e0",
-    "4376600001000000",                                   # the answer to somebody else's read of 6076h
-    "6072600000000000",                                   # to somebody else's write of 6072h
-    "8076600000000206",                                   # to his abort
+    "4376600001000000",                                   # the reply to a foreign read of 6076h
+    "6072600000000000",                                   # to a foreign write of 6072h
+    "8076600000000206",                                   # to a foreign abort
 ]
 
 
 @pytest.mark.parametrize("rubbish", RUBBISH)
-def test_rubbish_is_not_taken_for_the_answer(objects, wire, peer, rubbish):
+def test_invalid_frames_are_not_accepted_as_the_reply(objects, wire, peer, rubbish):
     peer.before_answer = lambda request: wire.put(0x581, bytes.fromhex(rubbish))
     assert objects.read(0x1000) == 0x00020192
     peer.before_answer = lambda request: wire.put(0x581, bytes.fromhex(rubbish))
@@ -149,7 +149,7 @@ def test_rubbish_is_not_taken_for_the_answer(objects, wire, peer, rubbish):
 
 @pytest.mark.parametrize("old", ["6072600000000000", "4f00100007000000"])
 def test_an_answer_that_comes_after_its_time_out_is_dropped(objects, wire, peer, old):
-    """It may even bear the same object: it lies on the bus before the question is asked."""
+    """It may have the same object: it is on the bus before the new request."""
     wire.put(0x581, bytes.fromhex(old))
     assert objects.read(0x1000) == 0x00020192
     wire.put(0x581, bytes.fromhex("6072600000000000"))
@@ -183,7 +183,7 @@ def test_change_and_restore(objects, peer):
     assert peer.writes == []
 
 
-def test_a_change_that_is_not_taken_over_shows(objects, peer):
+def test_a_change_that_is_not_stored_is_found(objects, peer):
     peer.deaf_to.add((0x6072, 0))
     assert objects.change(0x6072, 0, 500, 16) == 900
 
@@ -194,7 +194,7 @@ def test_a_negative_option_code_reads_back_as_itself(objects, peer):
     assert peer.value(0x605A) == 2
 
 
-def test_restore_goes_on_after_a_refusal_and_says_so(objects, peer):
+def test_restore_continues_after_a_refusal_and_reports_it(objects, peer):
     objects.change(0x6072, 0, 500, 16)
     objects.change(0x6085, 0, 70, 32)
     peer.refuse_write[0x6085, 0] = 0x08000022

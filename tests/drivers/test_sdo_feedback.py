@@ -1,4 +1,4 @@
-"""One sample beside the cycle, of every drive; and what it may say to a drive that is out of operation."""
+"""Poll beside the cycle, for every drive; and what a poll may write to a drive out of operation."""
 
 import math
 import struct
@@ -30,7 +30,7 @@ def requests(bench):
 
 
 def quietly(run, cycles, **setpoint):
-    """Cycles whose troubles are a stop's to bear; the fresh ones among their samples."""
+    """Run cycles and ignore the errors that a stop ignores; return the fresh samples."""
     found = []
     for _ in range(cycles):
         try:
@@ -40,7 +40,7 @@ def quietly(run, cycles, **setpoint):
     return [sample for sample in found if sample.fresh]
 
 
-def test_a_look_shows_what_the_cycle_shows(run):
+def test_a_poll_agrees_with_the_cycle(run):
     run.ready()
     run.enable()
     sample = run.go(3.0, speed=2.0)
@@ -50,12 +50,12 @@ def test_a_look_shows_what_the_cycle_shows(run):
     assert poll.speed_rad_s == pytest.approx(sample.speed_rad_s, abs=0.01 + 3.0 * run.bench.speed_lsb)
     assert math.isfinite(poll.torque_nm)
     assert abs(poll.torque_nm - sample.torque_nm) < 60.0
-    # Nothing was asked of the drive by it: the run goes on.
+    # The poll requests no change of state: the run continues.
     assert run.cycle(speed=2.0).state is PowerState.ENABLED
 
 
 @pytest.mark.heavy
-def test_in_pre_operational_it_sees_rest_and_disables(turning, bench):
+def test_in_pre_operational_it_finds_standstill_and_disables(turning, bench):
     bench.foreign(0x000, bytes((0x80, 1)))
     quietly(turning, 10, speed=2.0)
     turning.drive.quick_stop()
@@ -73,7 +73,7 @@ def test_in_pre_operational_it_sees_rest_and_disables(turning, bench):
     assert words and all(word & 0x0F != 0x0F for word in words)
 
 
-def test_a_stopped_node_is_asked_in_pre_operational(turning, bench):
+def test_a_stopped_node_is_polled_in_pre_operational(turning, bench):
     bench.foreign(0x000, bytes((0x02, 1)))
     quietly(turning, 40, speed=2.0)
     turning.drive.quick_stop()
@@ -95,12 +95,12 @@ def test_after_a_restart_nothing_is_enabled(turning, bench):
     for _ in range(200):
         quietly(turning, 10)
         last = turning.drive.poll()
-    assert abs(last.speed_rad_s) < 0.05 < abs(first.speed_rad_s)      # it coasted, and its time went on
+    assert abs(last.speed_rad_s) < 0.05 < abs(first.speed_rad_s)      # it coasted, and its time continued
     assert not any(data[1:4] == b"\x40\x60\x00" for data in requests(bench))
 
 
 def test_an_enabled_drive_gets_the_quick_stop_by_sdo(turning, bench):
-    """No RPDO reaches it; it is still in operation, and turns."""
+    """The drive receives no RPDO, but it is still in operation and turns."""
     send = bench.bus.send
     bench.bus.send = lambda message: None if message.arbitration_id == 0x201 else send(message)
     turning.drive.quick_stop()
@@ -113,7 +113,7 @@ def test_an_enabled_drive_gets_the_quick_stop_by_sdo(turning, bench):
 
 
 @pytest.mark.parametrize("head", [STATUS, SPEED])
-def test_no_answer_is_no_sample_and_is_asked_for_once(turning, bench, head):
+def test_without_a_reply_there_is_no_sample_and_no_second_request(turning, bench, head):
     bench.bus.change = lambda message: [
         message for _ in range(1) if message.arbitration_id != 0x581 or bytes(message.data[1:4]) != head[1:]
     ]
@@ -122,7 +122,7 @@ def test_no_answer_is_no_sample_and_is_asked_for_once(turning, bench, head):
     assert sum(data[:4] == head for data in requests(bench)) == 1
 
 
-def test_a_bus_that_is_gone(turning, bench):
+def test_a_lost_bus(turning, bench):
     bench.bus.send_error = OSError("gone")
     with pytest.raises(CommunicationLost):
         turning.drive.poll()
@@ -132,7 +132,7 @@ def test_a_bus_that_is_gone(turning, bench):
 
 
 @pytest.mark.parametrize("code", [1, 2, 4])
-def test_a_drive_that_takes_no_writes_is_still_seen(code):
+def test_a_drive_that_accepts_no_writes_is_still_polled(code):
     run = BankRun().enabled()
     run.bank.refuse = {6: code, 16: code, 23: code}
     run.drive.quick_stop()
@@ -141,12 +141,12 @@ def test_a_drive_that_takes_no_writes_is_still_seen(code):
     run.bank.requests.clear()
     poll = run.drive.poll()
     assert poll.fresh and poll.state is PowerState.ENABLED
-    assert [pdu[0] for pdu in run.bank.requests] == [3, 6, 3]        # read, the word tried by itself, the angle
+    assert [pdu[0] for pdu in run.bank.requests] == [3, 6, 3]        # read, the word in a separate write, the angle
     run.bank.machine.state = STOPPING
     assert run.drive.poll().state is PowerState.QUICK_STOP
 
 
-def test_the_quick_stop_word_goes_out_by_itself():
+def test_the_quick_stop_word_is_sent_alone():
     run = BankRun().enabled()
     run.bank.refuse = {23: 4}
     run.drive.quick_stop()
@@ -160,7 +160,7 @@ def test_the_quick_stop_word_goes_out_by_itself():
 
 
 @pytest.mark.parametrize("silent", [True, False])
-def test_a_drive_that_tells_nothing(silent):
+def test_a_drive_without_readable_registers(silent):
     run = BankRun().enabled()
     run.bank.silent = silent
     run.bank.refuse = {} if silent else dict.fromkeys((3, 6, 16, 23), 2)

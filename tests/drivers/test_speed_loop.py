@@ -1,4 +1,4 @@
-"""The gains of the drive's own speed loop, read in preflight: by objects, by registers, in every unit."""
+"""Gains of the drive's speed loop, read in preflight: by objects, by registers, in every unit."""
 
 import math
 
@@ -38,7 +38,7 @@ def rows_of(found):
 
 
 @pytest.mark.parametrize("bench", [CanopenBench, ModbusBench], indirect=True)
-def test_preflight_reads_what_the_simulated_drive_has(bench):
+def test_preflight_reads_the_gains_of_the_simulated_drive(bench):
     found = preflight(bench.drive)
     assert found.refused == ()
     present = found.speed_loop
@@ -120,7 +120,7 @@ def test_units(units, values, si):
     assert [check.name for check in checks] == ROWS
 
 
-def test_of_a_real_drive_nothing_is_read_that_only_the_simulated_one_has():
+def test_objects_of_the_simulator_are_not_read_from_a_real_drive():
     values = {"gain": 40.0, "integral": 0.5, "filter": 0.02}
     assert read(values, simulated=False, simulated_only=True) == (None, [])
     assert read(values, simulated=True, simulated_only=True)[0].gain_nm_s_rad == 40.0

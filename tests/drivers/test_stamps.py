@@ -1,4 +1,4 @@
-"""Stamps of frames against control time: followed, and a wall clock that is set is noticed and changes nothing."""
+"""Time stamps of frames and control time: the offset is tracked. A change of the wall clock has no effect."""
 
 import can
 import pytest
@@ -39,7 +39,7 @@ def test_a_jump_is_counted_once(jump_s):
 
 
 def test_a_clock_that_is_slewed_is_no_jump():
-    """500 ppm, the fastest that NTP steers, for an hour."""
+    """The clock slews for an hour at 500 ppm, the limit of NTP."""
     stamps = FrameStamps()
     for k in range(36_000):
         stamps.take(WALL_S + 0.1 * k * (1 + 5e-4), 0.1 * k)
@@ -50,7 +50,7 @@ def test_a_clock_that_is_slewed_is_no_jump():
 def test_a_host_that_slept_takes_its_old_frames_for_no_jump():
     stamps = FrameStamps()
     now_s = feed(stamps, WALL_S, 300)
-    for k in range(1000):                      # ten seconds' frames, all taken at once
+    for k in range(1000):                      # frames of ten seconds, all read at once
         stamps.take(WALL_S + now_s + 0.01 * k, now_s + 10.0 + 1e-5 * k)
     feed(stamps, WALL_S, 300, now_s + 10.02)
     assert stamps.jumps == 0
@@ -74,7 +74,7 @@ def test_no_delay_below_the_bound_is_a_jump(late_s):
 
 
 def turned(peer, wire, profile, wall_of):
-    """The samples of 1000 cycles in fake real time; ``wall_of`` says what the wall clock shows."""
+    """Return the samples of 1000 cycles in fake real time. ``wall_of`` gives the wall clock."""
     receive = wire.recv
 
     def stamped(timeout=0.0):
@@ -85,7 +85,7 @@ def turned(peer, wire, profile, wall_of):
 
     wire.recv = stamped
     drive = prepared(wire, profile, DRIVE_LIMITS, MonotonicClock())
-    # The scripted drive has no heartbeat of its own.
+    # The scripted drive has no heartbeat.
     drive._bus.watch.allowed_silence_s = 0.0
     samples = [drive.exchange(Command(Mode.SPEED, 0.0, 0.0)) for _ in range(1000)]
     return samples, drive.counters

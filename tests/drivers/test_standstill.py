@@ -1,4 +1,4 @@
-"""When a stop outside of any run accepts standstill: within one bound, and by the position if a count is coarser."""
+"""Standstill in a stop outside of any run: within one bound, and by the position if a count is coarser."""
 
 import json
 
@@ -37,7 +37,7 @@ def test_three_counts_are_noise_only_below_the_bound(count_rad_s, counts, near):
 
 
 class Turning:
-    """A position that turns at ``rad_s``, read every ``every_s``, and wraps."""
+    """Position that turns at ``rad_s``, is read every ``every_s``, and wraps."""
 
     def __init__(self, rad_s, every_s=0.04, wraps_rad=6.0, count_rad=0.002):
         self.rad_s, self.every_s, self.wraps_rad, self.time_s, self.fails = rad_s, every_s, wraps_rad, 0.0, False
@@ -55,7 +55,7 @@ class Turning:
 
 
 def longest_s(turning, test):
-    """Longest time at standstill without a break within ten seconds."""
+    """Return the longest uninterrupted time at standstill within ten seconds."""
     most = run = 0
     for _ in range(round(10.0 / turning.every_s)):
         run = run + 1 if test.near_zero(0) else 0
@@ -64,7 +64,7 @@ def longest_s(turning, test):
 
 
 @pytest.mark.parametrize(("rad_s", "stands"), [(0.0, True), (0.05, True), (-0.09, True), (0.2, False), (-1.0, False)])
-def test_a_coarse_speed_of_zero_needs_a_position_that_stands(rad_s, stands):
+def test_a_coarse_speed_of_zero_needs_a_constant_position(rad_s, stands):
     turning = Turning(rad_s)
     within_s = longest_s(turning, StandstillTest(10.0 * RPM, turning.find))
     assert within_s > 9.0 if stands else within_s < 1.0
@@ -72,8 +72,8 @@ def test_a_coarse_speed_of_zero_needs_a_position_that_stands(rad_s, stands):
 
 
 @pytest.mark.parametrize(("rad_s", "stands"), [(0.0, True), (0.05, True), (0.2, False), (1.0, False)])
-def test_a_fine_speed_of_zero_needs_a_position_that_stands_too(rad_s, stands):
-    """A lost speed signal reports zero, however fine its count is."""
+def test_a_fine_speed_of_zero_needs_a_constant_position_too(rad_s, stands):
+    """A lost speed signal reports zero with any resolution."""
     turning = Turning(rad_s)
     test = StandstillTest(RPM, turning.find)
     within_s = longest_s(turning, test)
@@ -99,7 +99,7 @@ def test_a_position_that_is_not_read_shows_no_standstill():
     (6.28, 10.0 * RPM, ("at most 0.2 rad/s", "There is no position to compare", "by sight")),
     (0.002, None, ("the unit of the reported speed is unknown", "The position was compared, too")),
 ])
-def test_it_says_so(count_rad, count_rad_s, words):
+def test_the_message_names_the_reason(count_rad, count_rad_s, words):
     turning = Turning(0.0, count_rad=count_rad)
     test = StandstillTest(count_rad_s, turning.find)
     assert test.remarks() == ()

@@ -1,4 +1,4 @@
-"""The pure state machine, against the standard's tables typed a second time (power_machine)."""
+"""Pure state machine, compared with a second copy of the standard's tables (power_machine)."""
 
 import pytest
 
@@ -52,11 +52,11 @@ def test_every_low_byte(high):
         (State.UNKNOWN, PowerState.UNKNOWN),
     ],
 )
-def test_what_callers_see(state, seen):
+def test_states_for_callers(state, seen):
     assert power_state(state) is seen
 
 
-# 6040h by state and wish, as the manual of any CiA 402 drive has them.
+# 6040h by state and request, as in the manual of any CiA 402 drive.
 WORDS = {
     #                          off   enabled  quick stop
     State.NOT_READY:             (0x00, 0x00, 0x02),
@@ -95,7 +95,7 @@ def follow(start, wish, cycles):
 
 @pytest.mark.parametrize("wish", list(PowerRequest))
 @pytest.mark.parametrize("start", [NOT_READY, OFF, READY, ON, ENABLED, STOPPING])
-def test_the_wish_is_reached_within_four_transitions_and_held(start, wish):
+def test_the_requested_state_is_reached_within_four_transitions_and_held(start, wish):
     path = follow(start, wish, 12)
     goal = {STOPPING} if (start, wish) == (STOPPING, PowerRequest.ENABLED) else NEAR[wish]
     assert path[4] in goal

@@ -1,6 +1,6 @@
-"""The bare quick stop as a table: for any sequence of readings it releases no shaft and believes no doubted standstill.
+"""Table of the bare quick stop: for any readings, it disables no turning shaft and accepts no doubtful standstill.
 
-What may end at rest is reckoned here from the readings alone, backwards from the last one.
+The tests derive the allowed ends at standstill from the readings alone, backwards from the last one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ AT_ZERO = st.builds(
     near_zero=st.just(True), standstill=st.booleans(), follows=st.just(False),
 )
 ERRORS = st.sampled_from((CommunicationLost("no reply", where="here"), DriveFault("refused", where="here")))
-# Readings last for a while, as a drive's do: a stop that only saw changes would never come to an end.
+# Readings last for some time, as with a drive. A stop with changing readings only would never end.
 PIECES = st.lists(
     st.tuples(st.one_of(AT_ZERO, READINGS, ERRORS), st.floats(0.02, 14.0), st.floats(0.02, 1.0)), min_size=1,
     max_size=12,
@@ -51,7 +51,7 @@ PIECES = st.lists(
 
 
 def rounds(pieces) -> list[StopRound]:
-    """The pieces in rounds: what is read, for how long, every how many seconds."""
+    """Return the pieces as rounds: reading, duration and interval."""
     found, now_s = [], 0.0
     for what, duration_s, every_s in pieces:
         until_s = now_s + duration_s
@@ -68,14 +68,14 @@ def doubted(one: StopRound) -> bool:
 
 @settings(max_examples=50, deadline=None)
 @given(PIECES)
-def test_a_shaft_that_turns_or_is_doubted_is_never_released_nor_called_at_rest(pieces):
+def test_a_turning_or_doubtful_shaft_is_never_disabled_nor_reported_at_standstill(pieces):
     never_released(pieces)
 
 
 @pytest.mark.heavy
 @settings(max_examples=150, deadline=None)
 @given(PIECES)
-def test_in_more_courses_neither(pieces):
+def test_the_same_with_more_sequences(pieces):
     never_released(pieces)
 
 
@@ -85,7 +85,7 @@ def never_released(pieces):
     for now in rounds(pieces):
         course, action = step(course, now)
         past.append(now)
-        assert action in (StopAction.REQUEST, StopAction.WATCH, StopAction.END)      # there is none that disables
+        assert action in (StopAction.REQUEST, StopAction.WATCH, StopAction.END)      # no action disables
         assert (action is StopAction.END) is (course.ended is not None)
         if action is StopAction.END:
             break
@@ -119,7 +119,7 @@ def test_every_state_has_its_row_and_no_row_disables():
 
 @dataclass
 class Script:
-    """A drive that is read as scripted, and to which nothing but the two methods of `Target` may be said."""
+    """Drive with scripted readings that accepts only the two methods of `Target`."""
 
     clock: SteppedClock
     script: list[StopRound]
@@ -148,7 +148,7 @@ class Script:
 
 @settings(max_examples=40, deadline=None)
 @given(PIECES, st.booleans())
-def test_the_loop_does_what_the_table_says_and_ends(pieces, refuses):
+def test_the_loop_follows_the_table_and_ends(pieces, refuses):
     clock = SteppedClock()
     drive = Script(clock, rounds(pieces), refuses)
     report = bare_stop(drive, clock, longest_s=20.0)

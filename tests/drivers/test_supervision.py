@@ -1,4 +1,4 @@
-"""What the drive says unasked."""
+"""Unsolicited messages of the drive: heartbeat and EMCY."""
 
 import pytest
 
@@ -68,7 +68,7 @@ def test_before_the_start_and_after_the_end_nothing_is_trouble(clock, event):
 
 
 def test_a_drive_is_given_a_moment_to_become_operational(clock):
-    """A heartbeat that was under way when it was started still says pre-operational; one much later means it."""
+    """A heartbeat sent before the start still shows pre-operational. A later one shows the true state."""
     watch = NodeWatch(5, clock)
     watch.start(0.0)
     watch.on_heartbeat(b"\x7f")
@@ -97,7 +97,7 @@ def test_silence_once(watch, clock):
     assert raised_by(watch) is None
 
 
-def test_a_drive_without_a_heartbeat_is_not_missed(clock):
+def test_without_a_heartbeat_there_is_no_timeout(clock):
     watch = NodeWatch(5, clock)
     watch.start(0.0)
     clock.wait_until(100.0)
@@ -127,7 +127,7 @@ def test_an_emcy_of_two_bytes_is_one(watch):
     assert "8130h" in raised_by(watch).what
 
 
-def test_a_heartbeat_without_a_byte_says_nothing(watch):
+def test_a_heartbeat_without_a_byte_is_ignored(watch):
     watch.on_heartbeat(b"")
     watch.check()
 

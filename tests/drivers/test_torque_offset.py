@@ -1,4 +1,4 @@
-"""The torque offset (CiA 402-2, 60B2h): mapped where asked for, sent with every cycle, and gone first on every stop."""
+"""Torque offset (60B2h, CiA 402-2): mapped on request, sent in every cycle, and removed first in every stop."""
 
 import struct
 from dataclasses import replace
@@ -29,7 +29,7 @@ def turning(bench):
 
 
 def offsets(bench):
-    """As they stand in RPDO2, per mille of 1000 N·m."""
+    """Return the offsets in RPDO2, in per mille of 1000 N·m."""
     return [struct.unpack("<bh", frame.data)[1] for frame in bench.frames if frame.identifier == 0x301]
 
 
@@ -44,14 +44,14 @@ def test_it_acts_with_the_cycle_and_is_added_to_the_speed_loop(bench):
     run = turning(bench)
     before = push(run, 0.0)
     after = push(run, 100.0, 5)
-    # 100 N·m behind the drive's 10 ms, before speed and integral have moved much
+    # 100 N·m after the drive's lag of 10 ms, before speed and integral change much
     assert after.torque_nm - before.torque_nm == pytest.approx(100.0 * 0.8, abs=12.0)
     assert offsets(bench)[-5:] == [100] * 5
     assert bench.read(*OFFSET) == 100
 
 
 @pytest.mark.heavy
-def test_it_is_zero_in_the_very_cycle_of_a_quick_stop_whatever_is_commanded(bench):
+def test_it_is_zero_in_the_cycle_of_a_quick_stop_for_any_command(bench):
     run = turning(bench)
     push(run, 100.0, 50)
     run.drive.quick_stop()
@@ -71,7 +71,7 @@ def test_it_is_zero_in_torque_mode(bench):
 
 
 @pytest.mark.heavy
-def test_it_is_refused_where_nobody_asked_for_it(bench):
+def test_it_is_refused_without_a_request(bench):
     bench.limits = LIMITS
     run = turning(bench)
     with pytest.raises(CommandRejected, match="none is mapped"):
@@ -106,7 +106,7 @@ def test_what_a_dead_host_left_is_gone_with_the_next_run_and_with_a_stop_from_ou
 
 
 @pytest.mark.heavy
-def test_a_stop_by_sdo_takes_it_away_first(bench):
+def test_a_stop_by_sdo_removes_it_first(bench):
     run = turning(bench)
     push(run, 100.0, 50)
     bench.drive._stand()

@@ -1,4 +1,4 @@
-"""What the adapter says of the bus, who else is on it, and that nothing more is sent where that could do harm."""
+"""Bus errors of the adapter, other nodes, and the end of transmission after bus-off."""
 
 import can
 import pytest
@@ -29,15 +29,15 @@ def error_frame(wire, identifier, *data):
     (0x04, bytes([0, 0x10]), Condition.PASSIVE),            # CAN_ERR_CRTL: receiver passive
     (0x04, bytes([0, 0x20]), Condition.PASSIVE),            # transmitter passive
     (0x04, bytes([0, 0x08]), Condition.ERROR),              # warning level
-    (0x20, bytes(8), Condition.ERROR),                      # nobody acknowledged
-    (0x00, b"", Condition.ERROR),                           # an interface that tells no more
+    (0x20, bytes(8), Condition.ERROR),                      # no acknowledgement
+    (0x00, b"", Condition.ERROR),                           # an interface without details
 ])
 def test_error_frames(identifier, data, found):
     assert condition(identifier, data) is found
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8))
-def test_any_error_frame_is_something(identifier, data):
+def test_any_error_frame_has_a_text(identifier, data):
     assert condition(identifier, data) in Condition
 
 
@@ -73,7 +73,7 @@ def test_bus_off_ends_sending_for_good(wire, link):
         link.send(0x080, b"")
     error_frame(wire, 0x40)
     wire.put(0x701, b"\x05")
-    link.drain()                                  # said once; what still comes is heard
+    link.drain()                                  # reported once; frames are still received
     assert wire.sent == []
     assert link.error_frames == 2
 
@@ -85,8 +85,8 @@ def test_error_passive_is_counted(wire, link):
     assert (link.error_frames, link.passive) == (2, 1)
 
 
-def test_other_programs_of_this_computer_are_heard(wire, link):
-    """SocketCAN marks their frames as it marks our own, which come back only to those who ask for them."""
+def test_frames_of_other_programs_on_this_computer_are_received(wire, link):
+    """SocketCAN marks their frames like our own. Own frames return only on request."""
     got = []
     link.handlers[0x080] = got.append
     wire.put(0x080, b"", is_rx=False)
@@ -94,10 +94,10 @@ def test_other_programs_of_this_computer_are_heard(wire, link):
     assert got == [b""]
 
 
-def test_a_second_master_is_told_with_its_second_frame_of_a_kind_however_late():
+def test_another_master_is_reported_with_its_second_frame_of_a_kind_at_any_time():
     clock = SteppedClock()
     watch = NodeWatch(1, clock)
-    watch.on_foreign("SYNC")                      # left by another run, and still under way
+    watch.on_foreign("SYNC")                      # from an earlier run, and still on the way
     watch.on_foreign("SYNC")
     watch.start(0.0)
     watch.on_foreign("SYNC")
@@ -108,7 +108,7 @@ def test_a_second_master_is_told_with_its_second_frame_of_a_kind_however_late():
     with pytest.raises(CommunicationLost, match="second master is on the bus: it sends SYNC"):
         watch.check()
     watch.on_foreign("setpoints")
-    watch.check()                                 # it has been told
+    watch.check()                                 # already reported
 
 
 @pytest.fixture
@@ -151,14 +151,14 @@ def test_two_nodes_of_one_id_are_found_before_anything_is_written(drive, wire, p
 
 
 @pytest.mark.parametrize("marker", [True, False])
-def test_only_a_simulated_peer_is_told_of_stages(wire, peer, profile, marker):
+def test_stages_are_sent_to_a_simulated_peer_only(wire, peer, profile, marker):
     if not marker:
         del peer.objects[0x5FFE, 1]
     from drivers.clock import MonotonicClock
 
     drive = CanopenDrive(wire, profile, MonotonicClock(), node=1)
     drive.announce("setup")
-    assert wire.sent == []                        # nobody knows yet who is there
+    assert wire.sent == []                        # the peer is not identified yet
     drive.connect()
     drive.announce("hold")
     drive.announce("nothing such")

@@ -1,4 +1,4 @@
-"""What a host that died leaves in a drive: written down before it is changed, and given back by whoever comes next."""
+"""Settings that a dead host leaves in a drive: recorded before each change, and restored by the next run."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def run(drive, limits=LIMITS):
     return drive.preflight(limits)
 
 
-def test_a_run_that_ends_leaves_neither_setting_nor_file(make, real, tmp_path):
+def test_a_completed_run_leaves_neither_setting_nor_file(make, real, tmp_path):
     drive = make()
     assert run(drive).refused == ()
     assert files(tmp_path) == ["drive-left-11-22-44-node1.json"]
@@ -79,8 +79,8 @@ def test_each_is_written_down_before_it_is_changed(make, real, tmp_path):
 
 
 def test_the_next_run_gives_back_what_a_killed_one_left(make, real, wire, tmp_path):
-    """And so it is the drive's own limit that stays, not the dead run's wider one."""
-    run(make())                                    # killed: nothing closes it
+    """Therefore the drive keeps its own limit, not the wider one of the dead run."""
+    run(make())                                    # killed without a close
     real.machine.state = "switch on disabled"
     assert real.value(0x6072) == 300
     drive = make()
@@ -96,14 +96,14 @@ def test_the_next_run_gives_back_what_a_killed_one_left(make, real, wire, tmp_pa
     assert files(tmp_path) == []
 
 
-def test_what_somebody_has_set_since_is_left_alone(make, real, tmp_path):
+def test_a_setting_that_was_changed_since_is_kept(make, real, tmp_path):
     run(make())
     real.objects[0x6072, 0] = u(77, 2)
     run(make(), on_wire.LIMITS)
     assert real.value(0x6072) == 77
 
 
-def test_another_drive_is_not_given_it(make, real, wire, tmp_path):
+def test_another_drive_does_not_receive_the_settings(make, real, wire, tmp_path):
     run(make())
     real.objects[0x1018, 4] = u(0x45, 4)
     real.objects[0x6072, 0] = u(300, 2)
@@ -111,7 +111,7 @@ def test_another_drive_is_not_given_it(make, real, wire, tmp_path):
     assert real.value(0x6072) == 300
 
 
-def test_of_a_simulated_drive_nothing_is_kept(wire, profile, tmp_path):
+def test_there_is_no_file_for_a_simulated_drive(wire, profile, tmp_path):
     ScriptedDrive(wire)
     drive = CanopenDrive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path, "node1"))
     run(drive)
@@ -119,7 +119,7 @@ def test_of_a_simulated_drive_nothing_is_kept(wire, profile, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"drive": "x", "settings": [{"where": "6072h"}]}', "\x00\xff"])
-def test_a_file_that_is_none_refuses_the_run_and_is_named(make, real, tmp_path, text):
+def test_an_invalid_file_refuses_the_run_and_is_named(make, real, tmp_path, text):
     path = tmp_path / "drive-left-11-22-44-node1.json"
     path.write_text(text)
     drive = make()
@@ -130,7 +130,7 @@ def test_a_file_that_is_none_refuses_the_run_and_is_named(make, real, tmp_path, 
     assert stands(real) == FOUND
 
 
-def test_a_folder_that_takes_no_file_refuses_before_anything_is_changed(wire, profile, real, tmp_path):
+def test_a_read_only_folder_refuses_before_any_change(wire, profile, real, tmp_path):
     drive = CanopenDrive(wire, profile, MonotonicClock(), node=1, journal=UndoJournal(tmp_path / "gone", "node1"))
     drive.connect()
     with pytest.raises(PreflightRefused, match="can't be written: "):

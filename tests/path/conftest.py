@@ -12,7 +12,7 @@ def _in_a_folder_of_its_own(no_bus_of_the_user):
 
 @pytest.fixture(scope="session")
 def short_run(tmp_path_factory):
-    """One short simulated run for all workers of pytest-xdist: a `Finished` with its log. Tests read it only."""
+    """Return one short simulated run for all workers of pytest-xdist: a `Finished` with its log. Tests only read it."""
     from tests.path.path_runs import SHORT, identify
 
     folder = tmp_path_factory.getbasetemp()

@@ -1,4 +1,4 @@
-"""A pair of virtual Ethernet interfaces for tests, or the reason why there is none."""
+"""Pair of virtual Ethernet interfaces for tests, or the reason for its absence."""
 
 import contextlib
 import itertools
@@ -15,7 +15,7 @@ _NUMBERS = itertools.count()
 
 
 def why_not():
-    """Return why this system has no segment to try, empty if it has one."""
+    """Return why this system has no segment for tests, or an empty text."""
     try:
         import pysoem  # noqa: F401
     except ImportError:
@@ -28,7 +28,7 @@ def why_not():
 
 
 def segment():
-    """Skip where this system has none; fail where TDHIL_REQUIRE_VETH forbids to skip. A module's own fixture."""
+    """Skip without a segment, or fail if TDHIL_REQUIRE_VETH forbids a skip. The fixture has module scope."""
     reason = why_not()
     if reason and os.environ.get("TDHIL_REQUIRE_VETH") == "1":
         pytest.fail(f"no run over EtherCAT was tried ({reason}); TDHIL_REQUIRE_VETH=1 forbids to skip", pytrace=False)
@@ -55,7 +55,7 @@ def pair():
 
 @contextlib.contextmanager
 def simulated_drive(folder, *arguments):
-    """`sim_bus ethercat` in a process of its own; its options are those of a host on the other end."""
+    """Run `sim_bus ethercat` in its own process; yield the options for a host at the other end."""
     trace = folder / "shaft.csv"
     with pair() as (ours, theirs), process(
         sys.executable, *PLAIN, "ethercat", "-i", theirs, "--trace", trace, *arguments, stdout=subprocess.PIPE

@@ -1,4 +1,4 @@
-"""The five stages over a bus, whichever it is: a fixture ``bus`` says how the drive on it is reached.
+"""Five stages over any bus: a fixture ``bus`` gives the options that reach the drive.
 
 `test_five_stages` runs them over a virtual bus in one process and over two processes through the socketcand hub,
 tests/vcan/test_five_stages over a real SocketCAN interface.
@@ -29,10 +29,10 @@ PERIODS = 3
 
 
 class FiveStages:
-    """Short excitation: what is tested is the path, not the last digit."""
+    """Tests of the path with a short excitation, not of the last digit."""
 
     replayed = True
-    """Whether the run is replayed as well: that takes as long again as its identification."""
+    """Whether the run is also replayed, which takes as long as its identification."""
 
     def test_the_five_stages_identify_the_inertia(self, bus, tmp_path):
         done, shaft = bus(tmp_path, *QUICK, "--periods", PERIODS)
@@ -61,7 +61,7 @@ class FiveStages:
         assert run.result == document
         assert {name for name, _ in done.outcomes} == {stage.name for stage in run.stages}
 
-        # the log has the frames too: a SYNC a sample
+        # the log has the frames too: one SYNC per sample
         syncs = sum(frame.identifier == 0x080 and frame.outgoing for frame in read_frames(done.log))
         assert syncs == sum(1 for _ in read_samples(done.log))
         if not self.replayed:
@@ -71,7 +71,7 @@ class FiveStages:
         assert card.code == 0
         assert "SIMULATED" in card.out
 
-        # replayed, it gives the same document but for the path
+        # a replay gives the same document except for the path
         moved = done.log.rename(tmp_path / "elsewhere.mcap")
         replayed = tdhil("replay", "--json", moved)
         assert replayed.code == 0
@@ -88,7 +88,7 @@ class FiveStages:
 
 
 def over_a_peer(folder, *arguments, on=()) -> tuple[Finished, Shaft]:
-    """The host in this process, the simulated drive in one of its own."""
+    """Run the host in this process and the simulated drive in another one."""
     with peer(folder, *on, "--seed", SEED, "--stepped") as drive:
         done = identify(folder, *drive.options, "--stepped", *arguments)
         drive.child.terminate()
@@ -97,7 +97,7 @@ def over_a_peer(folder, *arguments, on=()) -> tuple[Finished, Shaft]:
 
 
 def interrupted(folder, *, on=()) -> AbstractContextManager[tuple[Peer, Host]]:
-    """Host and simulated drive, each in a process of its own."""
+    """Run host and simulated drive in separate processes."""
     from contextlib import contextmanager
 
     from tests.path.path_runs import host

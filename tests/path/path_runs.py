@@ -1,6 +1,6 @@
-"""Runs of the whole path: the command line in this process or in one of its own, against a simulated drive.
+"""Runs of the whole path: the command line in this process or in its own, with a simulated drive.
 
-Nothing here asserts on wall time; the waits only bound what would otherwise hang.
+The assertions do not use wall time. The waits only prevent an endless wait.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from tdhil.cli.main import main
 from tests.rigs import NUMBERS
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
-QUICK = ("--rate", 50)    # a fifth of the drive's usual rate, and of the cycles to compute
+QUICK = ("--rate", 50)    # a fifth of the usual rate of the drive, to save computing time
 SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
 TOO_MUCH = ("--excitation", "sine", "--frequency", 0.2, "--amplitude", 3)
-"""A motion that a lighter shaft could do: a run finds out in stage 2 that this one can't, and ends there with 7."""
-POLL_S = 0.02             # between two looks of a wait: looks must not take the processor from what is waited for
-HANGS_S = 600.0           # wall time after which something is taken to hang, on however busy a computer
+"""Motion that a lighter shaft could follow. A run finds in stage 2 that this shaft cannot, and ends with 7."""
+POLL_S = 0.02             # polling interval, which must leave the processor to the other process
+HANGS_S = 600.0           # wall time after which a process is considered hung, even on a busy computer
 HELD = {"operation enabled", "quick stop active"}   # the states in which the drive holds its shaft
 
-# What the simulated rig is run with where nothing else is said (tdhil.config.rig, sim_bus.params).
+# Defaults of the simulated rig (tdhil.config.rig, sim_bus.params).
 WATCHDOG_S, QUICK_STOP_RAD_S2, TORQUE_NM = (NUMBERS[key] for key in ("watchdog_s", "quick_stop_rad_s2", "torque_nm"))
 INERTIA, SPEED_GAIN = 104.0, 300.0
 SETTLING_S = 5.0 * INERTIA / SPEED_GAIN
-"""How long the drive's own speed loop trails behind the end of its ramp: five times J/K_p."""
+"""Time by which the drive's speed loop lags the end of its ramp: five times J/K_p."""
 LETS_GO_S = 0.02 + 0.01 + 0.002
-"""How long a stop's torque acts on past zero: until the simulated drive sees zero (its speed filter) and has let go
-(torque lag, a control period)."""
+"""Time that the torque of a stop acts after zero speed: speed filter, torque lag and a control period of the drive."""
 SWINGS_IN_RAD_S = TORQUE_NM / INERTIA * LETS_GO_S
-"""How far a stop may carry the shaft past zero: its braking torque is the limit at most. How much it is
-depends on the speed and on the torque at the moment when the stop began, and so on when a signal or a cut came."""
+"""Largest reverse speed of the shaft by a stop, with the braking torque at its limit.
+
+The true speed depends on speed and torque at the beginning of the stop, and therefore on the time of the signal.
+"""
 
 
 @dataclass
 class Finished:
-    """How a run ended."""
+    """End of a run."""
 
     code: int
     out: str
@@ -61,7 +62,7 @@ class Finished:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Stdout as one JSON document and nothing else."""
+        """Return stdout, which must be one JSON document only."""
         found = json.loads(self.out)
         assert isinstance(found, dict)
         return found
@@ -72,13 +73,13 @@ class Finished:
 
 
 def clean_environment() -> dict[str, str]:
-    """Without the user's CAN settings, and without terminal sizes that aren't ours."""
+    """Return an environment without the user's CAN settings and terminal sizes."""
     dropped = ("CAN_", "COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR")
     return {name: value for name, value in os.environ.items() if not name.startswith(dropped)}
 
 
 def tdhil(*arguments: object) -> Finished:
-    """`tdhil …` in this process."""
+    """Run `tdhil …` in this process."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -89,7 +90,7 @@ def tdhil(*arguments: object) -> Finished:
 
 
 def identify(folder: Path, *arguments: object, log: str = "run.mcap") -> Finished:
-    """`tdhil identify --json …` in this process, with its log in ``folder``."""
+    """Run `tdhil identify --json …` in this process, with its log in ``folder``."""
     path = folder / log
     finished = tdhil("identify", "--json", "--log", path, *arguments)
     finished.log = path
@@ -101,7 +102,7 @@ def identify(folder: Path, *arguments: object, log: str = "run.mcap") -> Finishe
 
 @dataclass
 class Shaft:
-    """The true shaft: N rows of plant time, speed and torque, with states and events."""
+    """True shaft: N rows of plant time, speed and torque, with states and events."""
 
     time_s: np.ndarray
     speed_rad_s: np.ndarray
@@ -114,11 +115,11 @@ class Shaft:
         return ShaftTrace(path).read()
 
     def events(self, text: str) -> list[float]:
-        """Plant times of the events that contain a text."""
+        """Return the plant times of the events that contain a text."""
         return [float(t) for t, event in zip(self.time_s, self.event, strict=True) if text in event]
 
     def at_rest_from(self) -> float:
-        """Plant time from which the shaft stands still to the end of the trace."""
+        """Return the plant time from which the shaft is at standstill until the end of the trace."""
         turning = np.flatnonzero(np.abs(self.speed_rad_s) > 0.02)
         return float(self.time_s[turning[-1]]) if len(turning) else 0.0
 
@@ -126,7 +127,7 @@ class Shaft:
         return float(np.interp(time_s, self.time_s, self.speed_rad_s))
 
     def assert_never_let_go(self) -> None:
-        """No row in which the shaft turns without the drive holding it."""
+        """Assert that no row has a turning shaft with a disabled drive."""
         free = [state not in HELD for state in self.state]
         assert not np.any(np.abs(self.speed_rad_s[np.array(free)]) > 0.05), "a turning shaft was disabled"
 
@@ -134,21 +135,21 @@ class Shaft:
         assert ("operation enabled" in self.state) is expected
 
     def assert_at_rest(self) -> None:
-        """At rest at the end, for at least a second, and never let go before."""
+        """Assert standstill for at least a second at the end, and that the drive was never disabled in motion."""
         assert self.at_rest_from() <= self.time_s[-1] - 1.0
         self.assert_never_let_go()
 
     def assert_stopped_by_watchdog(self, cycle_s: float) -> float:
-        """The drive noticed the silent host in time and braked on its ramp; when the silence began."""
+        """Assert that the drive detects the silent host and brakes on its ramp in time; return the start of silence."""
         (silent_s,), (lost_s,) = self.events("running on in own time"), self.events("host heartbeat lost")
         assert lost_s - silent_s <= WATCHDOG_S + cycle_s
         assert self.at_rest_from() - lost_s <= self.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
-        assert self.state[-1] == "quick stop active"        # held, until somebody comes
+        assert self.state[-1] == "quick stop active"        # enabled until the next host
         self.assert_at_rest()
         return silent_s
 
     def assert_stopped_within_settings(self) -> float:
-        """A quick stop by the host brought it to rest on the ramp that the settings give; when that began."""
+        """Assert a quick stop by the host on the ramp of the settings; return its start."""
         begun_s = self.events("state: quick stop active")[-1]
         allowed_s = abs(self.speed_at(begun_s)) / QUICK_STOP_RAD_S2 + SETTLING_S
         assert self.at_rest_from() - begun_s <= allowed_s
@@ -158,9 +159,9 @@ class Shaft:
 
 @dataclass
 class ShaftTrace:
-    """Trace of a shaft that still turns. Each `read` parses only the rows that were added since the last one.
+    """Trace of a shaft that still turns. Each `read` parses only the rows added since the last one.
 
-    A wait reads the trace many times a second, beside the drive that writes it.
+    A wait reads the trace many times per second while the drive writes it.
     """
 
     path: Path
@@ -171,7 +172,7 @@ class ShaftTrace:
     _event: list[str] = field(default_factory=list)
 
     def read(self) -> Shaft:
-        """Return the whole shaft, up to the last whole row."""
+        """Return the whole shaft, up to the last complete row."""
         with self.path.open("rb") as file:
             file.seek(self._size)
             text, end, _ = file.read().rpartition(b"\n")
@@ -189,7 +190,7 @@ class ShaftTrace:
 
 
 def tail_time(trace: Path) -> float:
-    """Plant time of the last whole row."""
+    """Return the plant time of the last complete row."""
     size = trace.stat().st_size
     with trace.open("rb") as file:
         file.seek(max(0, size - 300))
@@ -200,7 +201,7 @@ def tail_time(trace: Path) -> float:
 def wait_for(
     what: str, done: Callable[[], bool], alive: subprocess.Popen | None = None, hangs_s: float = HANGS_S
 ) -> bool:
-    """Poll until done; False if ``alive`` ended before. A hang is an error."""
+    """Poll until done; return False if ``alive`` ends before. A hang is an error."""
     end = time.monotonic() + hangs_s
     while not done():
         if alive is not None and alive.poll() is not None:
@@ -220,7 +221,7 @@ REAL = (Path(__file__).with_name("simulator.py"), "patient,real")
 
 @contextlib.contextmanager
 def process(*command: object, **options: Any) -> Iterator[subprocess.Popen]:
-    """A child that doesn't outlive the test."""
+    """Yield a child process that ends with the test."""
     child = subprocess.Popen(
         [str(part) for part in command], env=clean_environment() | options.pop("env", {}), text=True, **options
     )
@@ -236,7 +237,7 @@ def process(*command: object, **options: Any) -> Iterator[subprocess.Popen]:
 
 @dataclass
 class Traced:
-    """A simulated drive that writes a trace of its shaft."""
+    """Simulated drive that writes a trace of its shaft."""
 
     trace: Path
 
@@ -246,11 +247,11 @@ class Traced:
 
     @property
     def shaft(self) -> Shaft:
-        """What the shaft has done so far."""
+        """Return the motion of the shaft so far."""
         return self._follower.read()
 
     def rests_after_watchdog(self) -> bool:
-        """The drive's own reaction is over, and the shaft has stood for more than a second."""
+        """Return whether the drive's reaction is over and the shaft is at standstill for more than a second."""
         shaft = self.shaft
         lost = shaft.events("host heartbeat lost")
         return bool(lost) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5 and shaft.at_rest_from() >= lost[0]
@@ -258,20 +259,20 @@ class Traced:
 
 @dataclass
 class Peer(Traced):
-    """A simulated drive in a process of its own, and how it is reached."""
+    """Simulated drive in its own process, and its address."""
 
     options: tuple[str, ...]
     child: subprocess.Popen
 
     @property
     def port(self) -> str:
-        """Of a Modbus drive."""
+        """Return the port of a Modbus drive."""
         return self.options[-1]
 
 
 @contextlib.contextmanager
 def peer(folder: Path, *arguments: object, program: tuple[object, ...] = PATIENT) -> Iterator[Peer]:
-    """A simulator with a socketcand hub of its own, unless ``arguments`` name another bus."""
+    """Yield a simulator with its own socketcand hub, unless ``arguments`` name another bus."""
     trace = folder / "shaft.csv"
     own_hub = "-i" not in arguments
     hub = ("--hub", "127.0.0.1:0") if own_hub else ()
@@ -294,7 +295,7 @@ def peer(folder: Path, *arguments: object, program: tuple[object, ...] = PATIENT
 
 @contextlib.contextmanager
 def modbus_peer(trace: Path, *arguments: object, program: tuple[object, ...] = PLAIN) -> Iterator[Peer]:
-    """A simulated Modbus drive on a free TCP port."""
+    """Yield a simulated Modbus drive on a free TCP port."""
     with process(sys.executable, *program, "modbus", "--tcp", "127.0.0.1:0", "--trace", trace, *arguments,
                  stdout=subprocess.PIPE) as child:
         assert child.stdout is not None
@@ -305,7 +306,7 @@ def modbus_peer(trace: Path, *arguments: object, program: tuple[object, ...] = P
 
 @dataclass
 class Host:
-    """`tdhil identify` in a process of its own, whose stderr is followed."""
+    """`tdhil identify` in its own process, with its stderr."""
 
     child: subprocess.Popen
     log: Path
@@ -316,7 +317,7 @@ class Host:
         return "\n".join(self.lines)
 
     def wait_for_line(self, text: str) -> bool:
-        """False if the process ended without it."""
+        """Wait for a line; return False if the process ends without it."""
         return wait_for(f"line {text!r}", lambda: any(text in line for line in self.lines), self.child)
 
     def signal(self, number: int) -> None:
@@ -333,7 +334,7 @@ class Host:
     def follow(self) -> None:
         def read() -> None:
             assert self.child.stderr is not None
-            with contextlib.suppress(ValueError):       # closed under it at the end of a failed test
+            with contextlib.suppress(ValueError):       # closed at the end of a failed test
                 for line in self.child.stderr:
                     self.lines.append(line.rstrip("\n"))
 
@@ -343,7 +344,7 @@ class Host:
 
 @contextlib.contextmanager
 def host(folder: Path, *arguments: object, command: str = "identify", **options: Any) -> Iterator[Host]:
-    """`python -m tdhil identify --json …`, or another command that runs a drive; its log in ``folder``."""
+    """Yield `python -m tdhil identify --json …`, or another command that runs a drive, with its log in ``folder``."""
     log = folder / "run.mcap"
     with process(
         sys.executable, "-m", "tdhil", command, "--json", "--log", log, *arguments,
@@ -355,7 +356,7 @@ def host(folder: Path, *arguments: object, command: str = "identify", **options:
 
 
 class Terminal:
-    """A program on a terminal of its own, 80 columns wide."""
+    """Program on its own terminal with 80 columns."""
 
     def __init__(self, *command: object, columns: int = 80, cwd: Path | None = None) -> None:
         import fcntl
@@ -382,7 +383,7 @@ class Terminal:
         os.close(self.master)
 
     def read_until(self, wanted: str) -> bool:
-        """Follow the output until it shows a text; False where the program ended without it."""
+        """Read the output until it contains a text; return False if the program ends without it."""
         end = time.monotonic() + HANGS_S
         while wanted not in self.plain:
             assert time.monotonic() < end, f"hangs before {wanted!r}:\n{self.plain}"
@@ -391,7 +392,7 @@ class Terminal:
         return True
 
     def finish(self) -> int:
-        """Follow it to its end; the exit code."""
+        """Read to its end; return the exit code."""
         end = time.monotonic() + HANGS_S
         while self._read():
             assert time.monotonic() < end, f"hangs:\n{self.plain}"
@@ -405,7 +406,7 @@ class Terminal:
 
     @property
     def plain(self) -> str:
-        """What was shown, without escape sequences."""
+        """Return the output without escape sequences."""
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.output.decode("utf-8", "replace"))
 
     def _read(self) -> bool:
@@ -414,7 +415,7 @@ class Terminal:
             return self.child.poll() is None
         try:
             data = os.read(self.master, 65536)
-        except OSError:           # the last one to hold the terminal has gone
+        except OSError:           # the last process on the terminal has ended
             return False
         self.output += data
         return bool(data)

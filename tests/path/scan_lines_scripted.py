@@ -1,4 +1,4 @@
-"""Modbus lines of the tests' own: one on which nobody answers, one that garbles, and one with a drive on unit 3."""
+"""Scripted Modbus lines: one without a reply, one with garbled replies, and one with a drive on unit 3."""
 
 from drivers.clock import Clock
 from drivers.modbus.link import Reply
@@ -9,7 +9,7 @@ IDENTIFICATION = (bytes.fromhex("2b 0e 01 01 00 00 03") + b"\x00\x07Danfoss" + b
 
 
 class Silent:
-    """A line with nobody on it."""
+    """Line without any unit."""
 
     description = "a silent line"
 
@@ -24,7 +24,7 @@ class Silent:
 
 
 class Garbled(Silent):
-    """Somebody answers at another baud rate."""
+    """Line with a unit at another baud rate."""
 
     description = "a garbled line"
 
@@ -33,7 +33,7 @@ class Garbled(Silent):
 
 
 class Answering(Silent):
-    """Unit 3 tells its name and refuses every register (exception 2)."""
+    """Line with unit 3, which sends its name and refuses every register (exception 2)."""
 
     description = "a line with a drive"
 

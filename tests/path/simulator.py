@@ -1,8 +1,8 @@
-"""`python -m sim_bus`, changed as a test needs it: ``simulator.py patient,real canopen …``
+"""`python -m sim_bus` with changes for tests: ``simulator.py patient,real canopen …``
 
-patient   a host that is silent for less than a minute of wall time is waited for: on a loaded machine a second is
-          nothing, and the runs here must repeat. The end of a connection acts at once all the same.
-real      without the simulator's marker object or registers: what the host then sees can't be told from a real drive.
+patient   wait for a host that is silent for less than a minute of wall time, because the runs must be reproducible on
+          a loaded computer. The end of a connection still acts at once.
+real      without the simulator's marker object or registers, so that the host cannot distinguish it from a real drive.
 """
 
 import functools

@@ -1,7 +1,7 @@
-"""A drive that takes a torque setpoint below zero for a large one, on the whole path: found at low speed, in stage 3.
+"""Drive that reads a negative torque setpoint as a large one, on the whole path: found at low speed, in stage 3.
 
-Whatever preflight may have seen of it at rest: here a drive reads setpoints rightly until it regulates torque, so that
-the braking probe is the first that can tell.
+Here the drive reads setpoints correctly until it regulates torque. Preflight at standstill cannot find the error, so
+the braking probe is the first check that can.
 """
 
 import numpy as np
@@ -19,10 +19,10 @@ PROFILES = {name: load_profile(name) for name in profile_names()}
 VENDORS = [name for name, one in PROFILES.items() if isinstance(one, ModbusProfile) and one.modes.torque]
 
 HALFWAY_RAD_S = 7.5
-"""Stage 2 goes up to 7.2 rad/s in speed mode; the limit is 10."""
+"""Bound of the speed of stage 2 in speed mode, which is up to 7.2 rad/s; the limit is 10 rad/s."""
 
 LOW_RAD_S = 5.0
-"""In torque mode: tried at 2.9 rad/s."""
+"""Bound of the speed in torque mode, where the probe is at 2.9 rad/s."""
 
 
 def assert_found(done, shaft, where):
@@ -35,7 +35,7 @@ def assert_found(done, shaft, where):
     assert done.outcomes[-1] == ("torque", "aborted")
     assert np.max(shaft.speed_rad_s) < HALFWAY_RAD_S
     stage_3 = int(np.argmax(shaft.speed_rad_s)) + np.searchsorted(
-        -shaft.speed_rad_s[int(np.argmax(shaft.speed_rad_s)) :], -3.2)      # slowed down to where it is tried
+        -shaft.speed_rad_s[int(np.argmax(shaft.speed_rad_s)) :], -3.2)      # slowed down to the speed of the probe
     assert np.max(shaft.speed_rad_s[stage_3:]) < LOW_RAD_S
     shaft.assert_at_rest()
 
@@ -48,7 +48,7 @@ def run(tmp_path, *arguments):
 
 @pytest.fixture
 def regulates_torque(monkeypatch):
-    """Has any drive regulated torque forward while it turned in stage 3?"""
+    """Return whether the drive regulated a forward torque in motion in stage 3."""
     speeds = {"fast": False}
     plain = Controller.torque
 

@@ -1,4 +1,4 @@
-"""The command line as its users and their scripts meet it: stdout, stderr, exit codes, sources of options."""
+"""Command line for users and scripts: stdout, stderr, exit codes, sources of options."""
 
 import json
 import subprocess
@@ -27,7 +27,7 @@ def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
                    "run: {json: true, seed: 1, periods: 3}\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
-        done = tdhil("identify", "--simulate", "--rig", rig)      # json, seed and periods: rig.yaml's word
+        done = tdhil("identify", "--simulate", "--rig", rig)      # json, seed and periods from rig.yaml
     assert done.code == 0, done.err
     document = done.document
     assert document.keys() >= KEYS
@@ -45,7 +45,7 @@ def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
     assert all(stage.keys() >= {"name", "outcome", "duration_s"} for stage in document["stages"])
     assert document["log"] == "run.mcap"
     assert (tmp_path / "run.mcap").exists()
-    assert "rig.yaml:4" in done.err                               # which value came from where
+    assert "rig.yaml:4" in done.err                               # the source of each value
 
 
 @pytest.mark.heavy
@@ -58,7 +58,7 @@ def test_a_seed_repeats_result_and_samples(short_run, tmp_path):
 
 
 @pytest.mark.heavy
-def test_without_a_seed_one_is_drawn_and_named(tmp_path):
+def test_without_a_seed_one_is_drawn_and_shown(tmp_path):
     runs = [identify(tmp_path, *QUICK, *TOO_MUCH, log=name) for name in ("a.mcap", "b.mcap")]
     seeds = [read_run(done.log).configuration["seed"] for done in runs]
     assert seeds[0] != seeds[1]
@@ -78,7 +78,7 @@ def test_an_older_log_is_kept(tmp_path):
     assert read_run(done.log).complete
 
 
-# -- what is wrong with the command line ---------------------------------------------------------------------
+# -- errors of the command line ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_wrong_command_line_ends_with_2_and_names_what_is_wrong(tmp_path, argu
     assert done.code == 2, done.err
     assert said in done.err
     assert "Traceback" not in done.err
-    assert "usage:" not in done.err           # two dozen lines that would hide what is wrong
+    assert "usage:" not in done.err           # two dozen lines that would hide the error
     assert done.out == ""
 
 
@@ -142,15 +142,15 @@ def test_a_bad_rig_shows_every_problem_with_its_line(tmp_path):
     assert "speed_max" in done.err
 
 
-def test_errors_are_json_too_where_json_was_asked_for(tmp_path):
+def test_errors_are_json_too_if_json_is_requested(tmp_path):
     done = identify(tmp_path, "--profile", "generic/cia40")
     assert done.code == done.document["exit_code"] == 2
     assert "generic/cia402" in done.document["error"]["message"]
 
 
 @pytest.mark.parametrize("size", [200, 2000])
-def test_a_log_cut_off_before_its_first_sample_is_told(tmp_path, size):
-    """As after a kill -9 in the first moment: nothing to identify from is no finding about the motion."""
+def test_a_log_truncated_before_its_first_sample_is_reported(tmp_path, size):
+    """The log has no data, as after an early kill -9. This is no finding about the motion."""
     writer = RunWriter(tmp_path / "whole.mcap", epoch_ns=0, block=True)
     RunLog(writer, {"tdhil": "1", "profile": {"text": "x" * 4000}}).close()
     log = tmp_path / "run.mcap"
@@ -162,7 +162,7 @@ def test_a_log_cut_off_before_its_first_sample_is_told(tmp_path, size):
 
 
 @pytest.mark.parametrize("content", [b"", b"not a log", b"\x89MCAP0\r\n"])
-def test_nothing_to_replay_is_told(tmp_path, content):
+def test_a_log_without_data_is_reported(tmp_path, content):
     log = tmp_path / "run.mcap"
     log.write_bytes(content)
     done = tdhil("replay", log)
@@ -172,7 +172,7 @@ def test_nothing_to_replay_is_told(tmp_path, content):
     assert done.out == ""
 
 
-def test_a_log_that_is_not_there_is_a_wrong_command_line(tmp_path):
+def test_a_missing_log_is_a_usage_error(tmp_path):
     done = tdhil("replay", "--json", tmp_path / "none.mcap")
     assert done.code == done.document["exit_code"] == 2
     assert "none.mcap" in done.err
@@ -182,14 +182,14 @@ def test_a_log_that_is_not_there_is_a_wrong_command_line(tmp_path):
     assert f"is a folder. {step}" in done.err
 
 
-def test_no_server_to_talk_to(tmp_path):
+def test_a_missing_server(tmp_path):
     done = identify(tmp_path, "-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1", "port=1")
     assert done.code == 5
     assert "127.0.0.1:1" in done.err
     assert done.document["exit_code"] == 5
 
 
-# -- buses, from wherever they are named ---------------------------------------------------------------------
+# -- buses from each source ------------------------------------------------------------------------
 
 
 @pytest.mark.heavy
@@ -198,7 +198,7 @@ def test_the_environment_names_the_bus(tmp_path, monkeypatch):
         monkeypatch.setenv("CAN_INTERFACE", "virtual")
         monkeypatch.setenv("CAN_CHANNEL", simulated.channel)
         done = identify(tmp_path, "--stepped", *QUICK, *TOO_MUCH)
-    assert done.code == 7, done.err                                # it got as far as the plan
+    assert done.code == 7, done.err                                # it reached the plan
     assert done.outcomes[1] == ("speed", "ok")
     lines = [" ".join(line.split()) for line in done.err.splitlines()]
     assert "bus interface virtual (CAN_INTERFACE)" in lines
@@ -217,7 +217,7 @@ def test_a_bus_without_a_drive_is_refused_with_the_likely_causes(tmp_path, monke
 
 
 @pytest.mark.heavy
-def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
+def test_simulate_takes_precedence_over_a_configured_bus(tmp_path, monkeypatch):
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
     done = identify(tmp_path, "--simulate", *QUICK, *TOO_MUCH)
     assert done.code == 7
@@ -228,7 +228,7 @@ def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("node", "code", "said"), [(5, 7, "amplitude of 3 rad/s"), (6, 4, "node 6 does not answer")]
 )
-def test_the_node_is_the_one_asked_for(tmp_path, node, code, said):
+def test_the_node_is_the_requested_one(tmp_path, node, code, said):
     with EmbeddedSimulator(RigParams(), node_id=5, stepped=True) as simulated:
         done = identify(tmp_path, "-i", "virtual", "-c", simulated.channel, "--stepped", "--node", node,
                         *QUICK, *TOO_MUCH)
@@ -236,11 +236,11 @@ def test_the_node_is_the_one_asked_for(tmp_path, node, code, said):
     assert said in done.err
 
 
-# -- runs that end otherwise ---------------------------------------------------------------------------------
+# -- runs with other ends ------------------------------------------------------------------------------------
 
 
 @pytest.mark.heavy
-def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
+def test_a_plan_that_does_not_fit_ends_at_standstill(tmp_path):
     trace = tmp_path / "shaft.csv"
     done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, *QUICK, *TOO_MUCH)
     assert done.code == 7
@@ -290,7 +290,7 @@ def test_one_tone_is_not_identifiable_and_the_paper_s_estimate_is_shown(tmp_path
 
 
 @pytest.mark.heavy
-def test_speed_mode_skips_what_belongs_to_torque_mode(tmp_path):
+def test_speed_mode_skips_the_stages_of_torque_mode(tmp_path):
     done = identify(tmp_path, *SHORT, "--mode", "speed")
     assert done.code in (0, 9), done.err
     assert done.outcomes == [
@@ -312,7 +312,7 @@ def test_another_plant_is_another_result(tmp_path):
 
 
 @pytest.mark.heavy
-def test_eighty_columns_are_enough(tmp_path):
+def test_eighty_columns_are_sufficient(tmp_path):
     command = (sys.executable, "-m", "tdhil", "identify", *SHORT)
     with Terminal(*command, columns=80, cwd=tmp_path) as terminal:
         assert terminal.finish() == 0
@@ -324,7 +324,7 @@ def test_eighty_columns_are_enough(tmp_path):
     assert "moment of inertia at the motor shaft · SIMULATED" in shown
 
 
-def test_help_is_quick_because_it_loads_nothing(tmp_path):
+def test_help_is_quick_without_imports(tmp_path):
     code = (
         "import sys, json\n"
         "from tdhil.cli.main import main\n"

@@ -1,4 +1,4 @@
-"""`tdhil identify --drive modbus`: the whole path on the embedded simulator, and everything that can be mistyped."""
+"""`tdhil identify --drive modbus`: the whole path on the embedded simulator, and usage errors."""
 
 import os
 import sys
@@ -45,7 +45,7 @@ def test_its_replay_is_identical(run):
     assert "SIMULATED" in tdhil("replay", run.log).out
 
 
-def test_the_log_says_how_the_drive_was_spoken_to(run):
+def test_the_log_contains_the_connection_to_the_drive(run):
     configuration = read_run(run.log).configuration
     assert configuration["drive"] == "modbus"
     assert configuration["bus"] == {"unit": {"value": "1", "source": "profile generic/modbus"}}
@@ -61,21 +61,21 @@ def test_a_seed_repeats_it(tmp_path):
     runs = [identify(tmp_path, "--profile", "generic/modbus", *QUICK, *TOO_MUCH, "--seed", 3, log=name)
             for name in ("a.mcap", "b.mcap")]
     for done in runs:
-        assert done.code == 7                                  # it got as far as the plan, which does not fit
+        assert done.code == 7                                  # it reached the plan, which does not fit
         assert "amplitude of 3 rad/s" in done.err
         assert "no Modbus host and no serial device is named" in done.err.replace("\n", " ")
     assert list(read_frames(runs[0].log)) == list(read_frames(runs[1].log))
 
 
 @pytest.mark.heavy
-def test_the_unit_is_the_one_asked_for(tmp_path):
+def test_the_unit_is_the_requested_one(tmp_path):
     done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, *QUICK, *TOO_MUCH)
     assert done.code == 7
     assert {frame.identifier for frame in read_frames(done.log)} == {17}
 
 
-def test_a_dry_run_knows_the_drive(tmp_path):
-    plain = ("--excitation", "sine", "--frequency", 0.5)          # soon planned
+def test_a_dry_run_uses_the_profile_of_the_drive(tmp_path):
+    plain = ("--excitation", "sine", "--frequency", 0.5)          # quick to plan
     done = tdhil("identify", "--drive", "modbus", "--simulate", "--dry-run", "--json", *plain)
     assert done.code == 0, done.err
     assert done.document["mode"] == "torque"
@@ -88,7 +88,7 @@ def test_a_dry_run_knows_the_drive(tmp_path):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("name", "bus"), [("maxon/epos4", "canopen"), ("siemens/g130-s120", "modbus")])
-def test_the_simulator_wears_the_profile(tmp_path, name, bus):
+def test_the_simulator_uses_the_profile(tmp_path, name, bus):
     profile = load_profile(name)
     done = identify(tmp_path, "--profile", name, "--simulate", *QUICK, *TOO_MUCH)
     assert "SIMULATED" in done.err
@@ -103,7 +103,7 @@ def test_the_simulator_wears_the_profile(tmp_path, name, bus):
     assert f"profile {name}: {doubts} entries are not verified" in done.err
 
 
-# -- what is not there, or may not be used -------------------------------------------------------------------
+# -- missing or unusable connections --------------------------------------------------------------------
 
 
 def test_nobody_listens_there(tmp_path):
@@ -154,16 +154,16 @@ def test_a_drive_in_another_process_over_tcp(tmp_path):
     assert "305419896" in looked.out
     assert nobody.code == 5
     assert "units 9" in nobody.err
-    assert profile.code == 4                                       # not its profile, and that is said
+    assert profile.code == 4                                       # not its profile, and the message states it
     assert "can't be read" in profile.out
 
 
-# -- a drive that is taken for a real one --------------------------------------------------------------------
+# -- a drive that is treated as a real one --------------------------------------------------------------------
 
 
 @pytest.fixture
 def real(monkeypatch, tmp_path):
-    """The embedded drive without the simulator's marker, in real time; its profile has doubtful entries."""
+    """Return the embedded drive without the simulator's marker, in real time, with unverified profile entries."""
     from sim_bus.modbus import registers
 
     monkeypatch.setattr(registers, "MARKER_TEXT", "somebody's drive")
@@ -179,7 +179,7 @@ def real(monkeypatch, tmp_path):
     return "--profile", path, "--rig", rig, "--simulate", "--real-time"
 
 
-def test_what_nobody_verified_is_refused_and_nothing_was_written(tmp_path, real):
+def test_unverified_entries_are_refused_without_any_write(tmp_path, real):
     for named in ((), ("--accept-unverified", "likely"), ("--accept-unverified", "watchdog")):
         done = identify(tmp_path, *real, "--yes", *named)
         assert done.code == 4
@@ -192,7 +192,7 @@ def test_what_nobody_verified_is_refused_and_nothing_was_written(tmp_path, real)
 
 
 @pytest.mark.heavy
-def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
+def test_the_prompt_names_the_overrides(tmp_path, real):
     done = identify(tmp_path, *real, "--accept-unverified", "likely", "--accept-unverified", "watchdog")
     assert done.code == 4
     assert "no operator can confirm" in done.err
@@ -202,8 +202,8 @@ def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
     assert [line.split(":")[0] for line in kept] == ["line (likely)", "watchdog (unverified)"]
 
 
-def test_without_a_name_nothing_real_is_moved(tmp_path, real):
-    """A result without a rig belongs to no history; the simulated rig needs none."""
+def test_without_a_rig_name_no_real_drive_moves(tmp_path, real):
+    """A result without a rig has no history. The simulated rig needs no name."""
     rig_file(tmp_path, RIG)
     done = identify(tmp_path, *real, "--yes", "--accept-unverified", "likely", "--accept-unverified", "watchdog")
     assert (done.code, done.document["error"]["code"]) == (4, "TDH-440")
@@ -211,7 +211,7 @@ def test_without_a_name_nothing_real_is_moved(tmp_path, real):
     assert [frame for frame in read_frames(done.log) if frame.outgoing and frame.data[0] in WRITING] == []
 
 
-def test_without_limits_nothing_is_moved(tmp_path, real):
+def test_without_limits_there_is_no_motion(tmp_path, real):
     done = identify(tmp_path, *real[:2], *real[4:], "--yes")
     assert done.code == 4
     assert "no machine limits" in done.err

@@ -1,4 +1,4 @@
-"""`tdhil doctor`: with nothing connected, with a drive, with one that is not right; and it writes to none of them."""
+"""`tdhil doctor`: without a drive, with a drive, and with a faulty one; it never writes to a drive."""
 
 import functools
 import json
@@ -20,7 +20,7 @@ GRADES = {"ok", "note", "bad"}
 
 
 def checks(done):
-    """name → every (grade, what was said) of that name."""
+    """Return name → list of (grade, message) with that name."""
     found = {}
     for line in done.out.splitlines():
         grade, _, rest = line.partition(" ")
@@ -49,7 +49,7 @@ def test_it_works_with_nothing_connected():
     assert "Traceback" not in done.err
 
 
-def test_json_says_the_same():
+def test_json_has_the_same_content():
     document = tdhil("doctor", "--json").document
     assert document["exit_code"] == 0
     assert {one["grade"] for one in document["checks"]} <= GRADES
@@ -70,14 +70,14 @@ def test_what_a_killed_run_left_in_a_drive_is_named(tmp_path):
     assert tdhil("doctor", "--log", tmp_path / "run.mcap").code == 0
 
 
-def test_a_rig_is_looked_at(tmp_path):
+def test_a_rig_is_checked(tmp_path):
     rig = tmp_path / "rig.yaml"
     rig.write_text("limits: {speed_min_rad_s: 1, speed_max_rad_s: 9, torque_nm: 50, time_s: 60, quick_stop_rad_s2: 1, "
                    "probe_torque_nm: 5, probe_travel_rad: 1}\nprofile: mine.yaml\n")
     done = tdhil("doctor", "--rig", rig)
     assert done.code == 4
     (line,) = [line for line in done.out.splitlines() if line.startswith("bad ")]
-    assert "mine.yaml: no such file" in line                       # a profile that isn't there hides no check before it
+    assert "mine.yaml: no such file" in line                       # a missing profile hides no earlier check
     rig.write_text(rig.read_text().replace("profile: mine.yaml", "profile: generic/cia402"))
     done = tdhil("doctor", "--rig", rig)
     assert done.code == 0
@@ -137,7 +137,7 @@ def test_a_drive_on_the_bus_is_read_and_never_written_to(monkeypatch):
     assert grades(done, "bit rate") == {"note"}
 
 
-def test_nobody_on_the_bus():
+def test_no_drive_on_the_bus():
     done = tdhil("doctor", "-i", "virtual", "-c", "nobody", "--node", 9)
     assert done.code == 4
     (line,) = [line for line in done.out.splitlines() if line.startswith("bad ")]
@@ -166,7 +166,7 @@ def link(state="ERROR-ACTIVE", bitrate=250000, sent=0, received=0):
     return json.dumps([{"ifname": "can0", "flags": ["UP"], "linkinfo": {"info_kind": "can", "info_data": data}}])
 
 
-def test_what_the_kernel_says_of_a_link():
+def test_kernel_reports_of_a_link():
     assert [(one.grade, one.name) for one in link_findings(link(), "can0")] == [
         ("ok", "bit rate"), ("ok", "bus state"), ("ok", "error counters"),
     ]
@@ -178,11 +178,11 @@ def test_what_the_kernel_says_of_a_link():
 
 
 @pytest.mark.parametrize("text", [None, "", "{}", "[]", "[1]", "null", '[{"ifname": "can0", "linkinfo": 3}]'])
-def test_what_the_kernel_should_not_say(text):
+def test_invalid_kernel_reports(text):
     assert all(one.grade == "note" for one in link_findings(text, "can0"))
 
 
-def test_a_link_that_is_not_there():
+def test_a_missing_link():
     done = tdhil("doctor", "-i", "socketcan", "-c", "nocan77")
     assert done.code == 4
     assert "nocan77" in done.out
@@ -204,7 +204,7 @@ def test_every_register_beside_its_meaning():
     assert registers["parameters.check_sign"]["counts"] == -12345
 
 
-def test_looking_at_a_modbus_drive_writes_nothing(monkeypatch):
+def test_a_check_of_a_modbus_drive_writes_nothing(monkeypatch):
     asked = []
     serve = embedded.EmbeddedModbusDrive.serve
 
@@ -219,7 +219,7 @@ def test_looking_at_a_modbus_drive_writes_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", ["word_order", "scale_10", "address_off_by_one", "unsigned"])
-def test_a_drive_that_is_not_as_its_profile_says(monkeypatch, wrong):
+def test_a_drive_that_differs_from_its_profile(monkeypatch, wrong):
     twisted = functools.partial(embedded.EmbeddedModbusDrive, wrongs=(Wrong(wrong),))
     monkeypatch.setattr(embedded, "EmbeddedModbusDrive", twisted)
     done = tdhil("doctor", "--drive", "modbus", "--simulate")

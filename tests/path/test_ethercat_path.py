@@ -1,4 +1,4 @@
-"""Whole runs over EtherCAT: pysoem and a simulated drive in a process of its own, over a pair of veth interfaces."""
+"""Whole runs over EtherCAT: pysoem and a simulated drive in its own process, over a pair of veth interfaces."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Logs, traces, reports: a live log is never moved, the last good one keeps its name, no foreign file is touched."""
+"""Logs, traces, reports: a live log is never moved, the last good one keeps its name, and no foreign file changes."""
 
 from __future__ import annotations
 
@@ -109,13 +109,13 @@ def test_a_bus_that_can_not_be_opened_is_no_reason_to_lose_the_last_log_s_name(t
     done = tdhil("identify", "--log", good, "-i", "socketcan", "-c", "no_such_can")
     assert done.code == 4
     assert good.read_bytes() == before
-    assert "was kept as" not in done.err      # it has its name again
+    assert "was kept as" not in done.err      # it has its former name
     replayed = tdhil("replay", tmp_path / "run.refused.mcap")
     assert replayed.code == 4
     assert "nothing to identify from: no_such_can" in replayed.err
 
 
-# -- files that are somebody else's ---------------------------------------------------------------------------
+# -- foreign files ------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_no_file_of_somebody_else_is_touched(bench, monkeypatch, option, name, s
     assert done.code == 2, done.err
     assert said in done.err.replace("\n", " ")
     assert name in done.err
-    assert {path: path.read_bytes() for path in bench.iterdir()} == before      # no log was begun either
+    assert {path: path.read_bytes() for path in bench.iterdir()} == before      # nor was a log started
 
 
 def test_a_replay_s_report_goes_over_nothing_either(bench, monkeypatch):
@@ -155,7 +155,7 @@ def test_a_replay_s_report_goes_over_nothing_either(bench, monkeypatch):
     assert "Name another file, or move the existing one" in " ".join(done.err.split())
 
 
-def test_a_report_that_comes_there_during_the_run_is_not_overwritten(tmp_path, monkeypatch):
+def test_a_report_created_during_the_run_is_not_overwritten(tmp_path, monkeypatch):
     from tdhil.report import html
 
     monkeypatch.setattr(html, "report_of", lambda *_: None)
@@ -167,12 +167,12 @@ def test_a_report_that_comes_there_during_the_run_is_not_overwritten(tmp_path, m
     assert [(tmp_path / f"r{n}.html").read_text() for n in ("", "-2", "-3")] == ["mine", "mine too", "page"]
 
 
-def test_a_recovered_copy_goes_over_no_other_file(bench):
+def test_a_recovered_copy_overwrites_no_other_file(bench):
     done = tdhil("recover", bench / "other.mcap", "-o", bench / "notes.txt")
     assert (done.code, (bench / "notes.txt").read_text()) == (2, "mine")
 
 
-def test_a_trace_goes_over_an_older_trace_only(tmp_path):
+def test_a_trace_overwrites_an_older_trace_only(tmp_path):
     path = tmp_path / "shaft.csv"
     path.write_text(HEADER + "0.01,1,2,ready,\n")
     ShaftTrace(path).close()
@@ -185,7 +185,7 @@ def test_a_trace_goes_over_an_older_trace_only(tmp_path):
     assert path.read_text() == "time_s,mine\n"
 
 
-def test_a_log_place_takes_no_foreign_file(tmp_path):
+def test_a_log_does_not_overwrite_a_foreign_file(tmp_path):
     path = tmp_path / "plan.yaml"
     path.write_text("kind: sine\n")
     with pytest.raises(UsageError, match="is not a log"):

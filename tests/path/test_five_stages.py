@@ -1,4 +1,4 @@
-"""The five stages over a virtual bus in one process, and over two processes through the socketcand hub."""
+"""Five stages over a virtual bus in one process, and in two processes through the socketcand hub."""
 
 import pytest
 
@@ -31,12 +31,12 @@ class TestFiveStages(FiveStages):
 
 
 WHERE_AND_WHEN = dict.fromkeys(("log", "date", "connection"), "")
-"""Of a document: what tells one run from its repetition."""
+"""Parts of a document that differ between a run and its repetition."""
 
 
 @pytest.mark.heavy
 def test_both_buses_give_the_same_result_and_the_same_samples(tmp_path):
-    """Stepped time and a seed: neither bus nor process may make a difference."""
+    """With stepped time and a seed, bus and process have no effect."""
     found = []
     for run in (embedded, over_a_peer):
         folder = tmp_path / run.__name__

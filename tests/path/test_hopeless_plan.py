@@ -1,4 +1,4 @@
-"""What no shaft could do is refused before the drive is touched; what this one can't do, in its own words."""
+"""Plans that no shaft could follow are refused before any access to the drive, with a specific message."""
 
 import io
 
@@ -42,7 +42,7 @@ TORQUE, SPEED = load_profile("generic/cia402"), load_profile("danfoss/fc302")
     (("--drive", "modbus", "--frequency", 20), "--frequency below"),
     (("--amplitude", 1e-6), "--amplitude"),
 ])
-def test_a_run_refuses_at_once_what_a_dry_run_does(tmp_path, monkeypatch, arguments, option):
+def test_a_run_refuses_at_once_the_plans_that_a_dry_run_refuses(tmp_path, monkeypatch, arguments, option):
     monkeypatch.chdir(tmp_path)
     runs = [tdhil("identify", *more, "--simulate", *arguments) for more in (("--dry-run",), QUICK)]
     for done in runs:
@@ -60,15 +60,15 @@ def test_a_value_with_another_unit_is_shown_without_the_digits_of_its_conversion
     assert "9.94838  (" in console.file.getvalue()
 
 
-def test_a_frequency_below_the_limit_runs_into_no_aliasing():
-    """The refusal before motion and the one after it are one rule: just below the limit, samples do show the lines."""
+def test_a_frequency_below_the_limit_has_no_aliasing():
+    """The refusals before and after motion use one rule: just below the limit, the samples contain the lines."""
     refuse_undersampled(ExcitationRequest("sine", frequency_hz=16.6), 100.0)
     with pytest.raises(PlanRefused, match=r"45 Hz.*below 45 Hz"):
         refuse_undersampled(ExcitationRequest("sine", frequency_hz=45.0), 100.0)
 
 
 def test_a_rate_that_turns_out_lower_is_refused_before_motion():
-    """The drive's line may be slower than the profile says: it is known in preflight, before the shaft moves."""
+    """The line of the drive may be slower than in the profile. Preflight finds this before motion."""
     drive = LineDrive(Line(period_s=0.1))
     outcome = run_line(drive, ExcitationRequest("sine", frequency_hz=5.0)).outcome
     assert isinstance(outcome.cause, PreflightRefused)
@@ -76,7 +76,7 @@ def test_a_rate_that_turns_out_lower_is_refused_before_motion():
     assert outcome.stop is None
 
 
-def test_a_tone_runs_and_says_before_it_that_no_interval_is_expected():
+def test_a_tone_runs_with_a_notice_that_no_interval_is_expected():
     options = resolve({"excitation": "sine", "frequency_hz": 1.0}, None)
     said = say_before(options, None, load_profile("generic/cia402"), True)
     assert said is not None
@@ -89,14 +89,14 @@ def test_a_tone_runs_and_says_before_it_that_no_interval_is_expected():
     {"excitation": "sine", "frequency_hz": 1.0},
     {"amplitude_rad_s": 1.0, "offset_rad_s": 4.0}, {"excitation": "step", "periods": 3}, {"rate_hz": 20.0},
 ])
-def test_what_may_be_done_is_not_refused(arguments):
+def test_possible_plans_are_not_refused(arguments):
     refuse_hopeless(resolve(arguments, None), None, TORQUE)
     if arguments.get("excitation") != "coast-down":
         refuse_hopeless(resolve(arguments, None), None, SPEED)
 
 
-def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
-    """An amplitude that the assumed shaft is too heavy for: a lighter one may turn out to hang there."""
+def test_a_plan_that_depends_on_the_shaft_is_left_to_the_run(tmp_path):
+    """The assumed shaft is too heavy for this amplitude, but the true one may be lighter."""
     rig = loaded_rig(tmp_path, limits_text(watchdog_s=None), "expected: {inertia_kg_m2: 2000}\n")
     options = resolve({"amplitude_rad_s": 1.0, "excitation": "sine", "frequency_hz": 0.5}, rig)
     refuse_hopeless(options, rig, TORQUE)
@@ -105,8 +105,8 @@ def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
 @pytest.mark.parametrize(("profile", "lets_go"), [
     ("siemens/s120-canopen", True), ("siemens/g130-s120", True), ("generic/cia402", False), ("generic/modbus", False),
 ])
-def test_a_dry_run_knows_what_lets_go_of_a_string(tmp_path, profile, lets_go):
-    """By the profile, as the run itself refuses it in preflight."""
+def test_a_dry_run_refuses_a_quick_stop_that_releases_a_string(tmp_path, profile, lets_go):
+    """The profile shows it, and the run itself refuses it in preflight."""
     rig = rig_file(tmp_path, STRING, limits_text(watchdog_s=None), name="string.yaml")
     done = tdhil("identify", "--dry-run", "--simulate", "--rig", rig, "--profile", profile,
                  "--excitation", "sine", "--frequency", 0.5)

@@ -1,7 +1,7 @@
-"""`tdhil identify --impedance` on the simulated drive through CANopen: the whole path, its replay, its faults.
+"""`tdhil identify --impedance` on the simulated drive by CANopen: the whole path, its replay, its faults.
 
-At 50 Hz and with few periods: a run is a fifth of what it is at the drive's usual rate. Many seeds, at the usual rate,
-are benchmarks/impedance_coverage.py's.
+The runs have 50 Hz and few periods, which takes a fifth of the usual computing time. For many seeds at the usual rate
+see benchmarks/impedance_coverage.py.
 """
 
 import json
@@ -24,7 +24,7 @@ def measured(tmp_path_factory):
 
 
 @pytest.mark.heavy
-def test_the_drives_own_gains_and_reflection_come_out_of_a_run(measured):
+def test_a_run_finds_the_gains_and_the_reflection_of_the_drive(measured):
     assert measured.done.code == 0, measured.done.err
     found = measured.done.document["impedance"]
     assert (found["verdict"], found["by"]) == ("valid", "offset")
@@ -39,7 +39,7 @@ def test_the_drives_own_gains_and_reflection_come_out_of_a_run(measured):
 
 
 @pytest.mark.heavy
-def test_its_replay_says_the_same(measured):
+def test_its_replay_agrees(measured):
     again = tdhil("replay", measured.log, "--json")
     assert again.code == 0
     assert json.loads(again.out)["impedance"] == measured.done.document["impedance"]

@@ -1,6 +1,6 @@
-"""Every shipped profile through the five stages, or their speed-mode variant, against the simulator that wears it.
+"""Every shipped profile in the five stages, or their speed-mode variant, on the simulator with that profile.
 
-One seed here; twenty, and how often the interval covers: `benchmarks/every_profile.py`.
+The tests use one seed. `benchmarks/every_profile.py` uses twenty and measures the coverage.
 """
 
 from statistics import fmean
@@ -11,16 +11,16 @@ from profiles.library import load_profile, profile_names
 from tests.path.path_runs import Shaft, identify, tdhil
 
 TRUE_KG_M2 = 104.0
-# generic/cia402 is what tests/path/test_five_stages.py runs; EPOS4 takes four times as long as any other.
-# The simulated EtherCAT drive wears its own profile alone (tests/path/test_ethercat_path.py), and says so.
+# tests/path/test_five_stages.py runs generic/cia402. EPOS4 takes four times as long as any other profile.
+# The simulated EtherCAT drive accepts its own profile only (tests/path/test_ethercat_path.py).
 NAMES = [name for name in profile_names()
          if name not in ("generic/cia402", "maxon/epos4") and load_profile(name).bus != "ethercat"]
 
 
 def weighed(name):
-    """One of each bus in CI; the others differ in registers only.
+    """Mark the profiles: CI runs one per bus, since the others differ in registers only.
 
-    Without these, tests/path/test_cli_modbus.py runs the generic profile, and test_braking_probe.py those of vendors.
+    Also, tests/path/test_cli_modbus.py runs the generic profile, and test_braking_probe.py those of vendors.
     """
     heavy = name in ("siemens/g120", "siemens/s120-canopen")
     return pytest.param(name, marks=pytest.mark.heavy if heavy else pytest.mark.long)
@@ -40,7 +40,7 @@ def test_the_inertia(name, tmp_path):
     assert inertia["low"] < TRUE_KG_M2 < inertia["high"]
     outcomes = dict(done.outcomes)
     assert [outcomes[stage] for stage in ("setup", "speed", "acquire")] == ["ok"] * 3
-    if not profile.can_torque:                        # no torque mode, or none under way
+    if not profile.can_torque:                        # no torque mode, or none in motion
         assert (outcomes["torque"], outcomes["hold"]) == ("skipped", "skipped")
     Shaft.read(trace).assert_at_rest()
 
@@ -50,10 +50,10 @@ def test_the_inertia(name, tmp_path):
     pytest.param(range(1, 12), marks=pytest.mark.long),
 ], ids=["3 seeds", "11 seeds"])
 def test_the_cross_check_of_a_slow_line_has_no_bias(seeds, tmp_path):
-    """A rig of `rig new` with 15 cycles a second: the cross-check of a sound run was 3 % too high, and contradicted it.
+    """On a rig of `rig new` with 15 cycles per second, the cross-check of a good run used to be 3 % too high.
 
     The mean of n independent results deviates by at most the stated half-width over the root of n, with 95 % coverage.
-    200 seeds of each profile: `benchmarks/cross_check_alarms.py`.
+    For 200 seeds of each profile see `benchmarks/cross_check_alarms.py`.
     """
     rig = tmp_path / "rig.yaml"
     assert tdhil("rig", "new", "--profile", "siemens/g120", "--load", "none", "--name", "bench", rig).code == 0

@@ -1,9 +1,8 @@
-"""A drive wired otherwise than its profile says, on the whole path: what is refused before motion, and what can't be.
+"""Drive that differs from its profile, on the whole path: errors that are refused before motion, and others.
 
-A register without a twin, an echo or a name plate to compare it with says nothing of its own scale or sign. Where
-that is so of a setpoint, a real drive is refused until the operator takes it by name (``echoes.speed``). Then the first
-that can tell is the sign probe, which pushes forward at walking pace, or for what is read without a sign the braking
-probe, which brakes once at low speed before torque mode goes on.
+Scale and sign of a register can only be checked with a second register, an echo or a name plate. A real drive with an
+unchecked setpoint is refused without an override (``echoes.speed``). The next check is then the sign probe, forward at
+low speed. For a value that is read without a sign it is the braking probe, at low speed before torque mode continues.
 """
 
 from functools import partial
@@ -28,7 +27,7 @@ ONE_REGISTER = "all of its numbers take one register each: there is no order tha
 NO_TWIN = "the documents at hand name no register in which the setpoint shows before the ramp lets it through"
 NO_SIGN = "nothing that it has or shows at rest is below zero: the speed words have no sign, the direction is a bit"
 NO_SIGNED_TWIN = "its speed words have no sign, and nothing shows a torque setpoint before the drive regulates torque"
-"""Not on delta/ms300, which has no torque setpoint: there only what is reported could be without its sign."""
+"""Reason for profiles other than delta/ms300, which has no torque setpoint: there only a report could lack the sign."""
 
 PLAIN_16 = ("delta/ms300", "lenze/i550", "schneider/atv320", "schneider/atv340-930", "siemens/g120",
             "siemens/g130-s120", "yaskawa/ga700")
@@ -45,7 +44,7 @@ ALWAYS = ("generic/modbus", "abb/acs880-classic")
 
 
 def some_always(cases):
-    """The cases of two profiles at every run, of the others with --long."""
+    """Mark the cases: those of two profiles in every run, those of the others with --long."""
     return [pytest.param(*case, marks=() if case[0] in ALWAYS else pytest.mark.long) for case in cases]
 
 
@@ -66,7 +65,7 @@ def test_refused_before_the_shaft_moves(name, wrong, monkeypatch, tmp_path):
     wired(monkeypatch, wrong)
     done, shaft = ran(tmp_path, name)
     assert done.code == 4, done.err
-    assert done.document["error"]["message"].count(". ") >= 1       # and what to do
+    assert done.document["error"]["message"].count(". ") >= 1       # and the next step
     assert "Traceback" not in done.err
     assert np.max(np.abs(shaft.speed_rad_s)) < 0.001
     shaft.assert_enabled(False)
@@ -74,7 +73,7 @@ def test_refused_before_the_shaft_moves(name, wrong, monkeypatch, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "sign"])
-def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch, tmp_path):
+def test_a_sign_that_no_register_shows_ends_in_the_sign_probe(name, monkeypatch, tmp_path):
     wired(monkeypatch, "sign")
     done, shaft = ran(tmp_path, name)
     assert done.code == 4, done.err
@@ -85,15 +84,20 @@ def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch,
 
 
 SEEMS_TO_ACCELERATE = {"yaskawa/ga700"}
-"""Drives whose unsigned torque report shows a quick stop that accelerates: tdhil removes the torque, and the stop is
-not confirmed. Without a drill string this is the rule (docs/explanation/stop.md)."""
+"""Drives whose unsigned torque report looks like a quick stop that accelerates.
+
+tdhil removes the torque, and the stop is not confirmed. This is the rule without a drill string
+(docs/explanation/stop.md).
+"""
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "unsigned"])
-def test_a_missing_sign_that_no_register_tells_ends_in_the_braking_probe(name, monkeypatch, tmp_path):
-    """All drives with a torque mode, whatever preflight sees: test_braking_probe. Without one there is no torque to
-    set. The shaft then slows down under a torque that is reported as positive, which no shaft does."""
+def test_a_missing_sign_that_no_register_shows_ends_in_the_braking_probe(name, monkeypatch, tmp_path):
+    """Drives without a torque mode have no torque setpoint; for all others see test_braking_probe.
+
+    The shaft slows down with a torque that is reported as positive, which is a contradiction.
+"""
     wired(monkeypatch, "unsigned")
     done, shaft = ran(tmp_path, name)
     if load_modbus_profile(name).modes.torque:
@@ -109,8 +113,8 @@ def test_a_missing_sign_that_no_register_tells_ends_in_the_braking_probe(name, m
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "scale_10"])
-def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_path):
-    """Tenfold counts: a command is a tenth of what is meant, so the shaft is slower than asked, never faster."""
+def test_a_scale_that_no_register_shows_gives_no_number(name, monkeypatch, tmp_path):
+    """With tenfold counts, a command is a tenth of the intended value, so the shaft is slower, never faster."""
     wired(monkeypatch, "scale_10")
     done, shaft = ran(tmp_path, name)
     assert done.code in (4, 6, 7, 8), done.err
@@ -120,7 +124,7 @@ def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_p
 
 
 @pytest.mark.parametrize("name", some_always((name,) for name in NAMES))
-def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
+def test_preflight_notes_unchecked_registers(name, monkeypatch, tmp_path):
     from tests.drivers.modbus_bench import driven
 
     profile = load_modbus_profile(name)
@@ -139,7 +143,7 @@ def unseen(profile):
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if unseen(load_modbus_profile(name))])
-def test_a_real_drive_with_a_setpoint_that_no_register_tells_is_refused_unless_it_is_taken_by_name(name):
+def test_a_real_drive_with_an_unchecked_setpoint_is_refused_without_an_override(name):
     profile = load_modbus_profile(name)
     asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
     others = {"likely", "echoes", *profile.below("unverified")} - asked
@@ -149,15 +153,15 @@ def test_a_real_drive_with_a_setpoint_that_no_register_tells_is_refused_unless_i
     assert set(lines) == asked
     assert all(f"--accept-unverified {one}" in str(refused.value) for one in asked)
     require_accepted(profile, others | asked)
-    assert asked <= {line.split()[0] for line in accepted_lines(profile, others | asked)}     # stands in the prompt
+    assert asked <= {line.split()[0] for line in accepted_lines(profile, others | asked)}     # named in the prompt
 
 
 @pytest.mark.parametrize(("name", "wrong"), [
     (name, wrong) for name, wrong in UNTOLD if wrong != "word_order" and unseen(load_modbus_profile(name))
 ])
-def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, monkeypatch, tmp_path):
+def test_no_error_of_an_unchecked_setpoint_moves_a_real_shaft_without_an_override(name, wrong, monkeypatch, tmp_path):
     wired(monkeypatch, wrong)
-    monkeypatch.setattr(registers, "MARKER_TEXT", "somebody's drive")         # taken for a real one
+    monkeypatch.setattr(registers, "MARKER_TEXT", "somebody's drive")         # treated as a real one
     profile, trace = load_modbus_profile(name), tmp_path / "shaft.csv"
     asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
     others = {"likely", *profile.below("unverified")} - asked
@@ -170,8 +174,8 @@ def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, 
     Shaft.read(trace).assert_enabled(False)
 
 
-def test_what_moves_before_anyone_can_tell_has_been_taken_by_name():
-    """But for signs of what a drive reports: at rest that is zero, and zero has none."""
+def test_each_motion_before_a_check_has_an_override():
+    """The exception is the sign of a report, which is zero at standstill."""
     left = {(name, wrong) for name, wrong in UNTOLD if wrong != "word_order"}
     taken = {(name, wrong) for name, wrong in left if unseen(load_modbus_profile(name))}
     assert left - taken == {("delta/ms300", "sign"), ("delta/ms300", "unsigned")}

@@ -1,4 +1,4 @@
-"""The gains that the drive reports, on the whole path: preflight, log, document, replay, `tdhil tune speed`."""
+"""Gains that the drive reports, on the whole path: preflight, log, document, replay, `tdhil tune speed`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLANT = "drive: {speed_gain_nm_s_rad: 250.0, speed_integral_gain_nm_rad: 125.0}\
     (("--drive", "ethercat", *QUICK), ["5FFDh:1", "5FFDh:2", "5FFDh:3"]),
     (("--drive", "modbus", *QUICK), ["register 64", "register 66", "register 68"]),
 ])
-def test_they_are_shown_without_typing(tmp_path, words, where):
+def test_they_are_shown_without_input(tmp_path, words, where):
     run = identify(tmp_path, "--simulate", *words, "--plant", plant_file(tmp_path, PLANT), "--seed", 3, "--periods", 3)
     assert run.code == 0, run.err
     present = run.document["speed_loop_present"]

@@ -1,4 +1,4 @@
-"""`tdhil profiles`: the table, a page for a person at the drive, and a file that is wrong."""
+"""`tdhil profiles`: the table, a page of one profile, and wrong files."""
 
 import io
 import sys
@@ -28,7 +28,7 @@ def test_the_table_has_every_profile_that_ships():
 
 @pytest.mark.heavy(but_first=5)
 @pytest.mark.parametrize("name", profile_names())
-def test_a_page_leaves_nothing_out(name, monkeypatch):
+def test_a_page_is_complete(name, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
     profile = load_profile(name)
     done = tdhil("profiles", "show", name)
@@ -59,7 +59,7 @@ def test_a_page_fits_80_columns(monkeypatch):
     assert max(map(len, tdhil("profiles").out.splitlines())) <= 80
 
 
-def test_an_unknown_name_is_answered_with_those_that_come_close():
+def test_an_unknown_name_lists_similar_names():
     done = tdhil("profiles", "show", "generic/modbuss")
     assert done.code == 2
     assert "did you mean 'generic/modbus' or" in done.err
@@ -69,7 +69,7 @@ def test_an_unknown_name_is_answered_with_those_that_come_close():
     ("abb", "abb/"), ("ABB", "abb/"), ("siemens/", "siemens/"), ("siem", "siemens/"), ("abb/acs880", "abb/acs880"),
     ("acs880", "abb/acs880"), ("generic", "generic/"),
 ])
-def test_a_vendor_shows_what_the_vendor_has(asked, wanted, monkeypatch):
+def test_a_vendor_name_shows_its_profiles(asked, wanted, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     done = tdhil("profiles", "show", asked)
     assert done.code == 0, done.err
@@ -82,7 +82,7 @@ def test_a_vendor_shows_what_the_vendor_has(asked, wanted, monkeypatch):
 @pytest.mark.parametrize(("asked", "name"), [
     ("nanotec", "nanotec/c5-e"), ("c5", "nanotec/c5-e"), ("MS300", "delta/ms300"),
 ])
-def test_what_only_one_begins_with_is_that_one(asked, name):
+def test_a_unique_prefix_selects_its_profile(asked, name):
     done = tdhil("profiles", "show", asked)
     assert done.code == 0, done.err
     assert done.out.startswith(f"{name}: ")
@@ -92,19 +92,19 @@ def test_what_only_one_begins_with_is_that_one(asked, name):
 @pytest.mark.parametrize(("asked", "meant"), [
     ("simens", "siemens/"), ("epso4", "maxon/epos4"), ("generic/cia401", "generic/cia402"), ("schnieder", "schneider/"),
 ])
-def test_a_slip_of_the_fingers_is_answered_with_what_comes_close(asked, meant):
+def test_a_misspelt_name_lists_similar_names(asked, meant):
     done = tdhil("profiles", "show", asked)
     assert done.code == 2
     assert f"did you mean '{meant}" in done.err
 
 
-def test_no_title_takes_a_real_drive_for_the_simulator():
-    """On Modbus the title is all the name that a peer has: it heads the preflight and stands in the prompt."""
+def test_no_title_suggests_that_a_real_drive_is_simulated():
+    """On Modbus the title is the only name of a peer. It is in the heading of preflight and in the prompt."""
     for name in profile_names():
         assert "simulat" not in load_profile(name).title.lower(), name
 
 
-def test_what_ships_is_right():
+def test_shipped_profiles_are_valid():
     done = tdhil("profiles", "check", *profile_names())
     assert done.code == 0, done.err
     assert len(done.out.splitlines()) == len(profile_names())
@@ -124,14 +124,14 @@ def test_every_problem_is_a_line_with_its_place(tmp_path):
     assert len(lines) == 2
     assert lines[0].startswith(f"{path}:{at['highfirst']}: line.word_order: ")
     assert lines[1].startswith(f"{path}:{at['rate: 100.0']}: ")
-    assert "generic/cia402: ok" in done.out                        # one that is wrong hides no other
+    assert "generic/cia402: ok" in done.out                        # a wrong file hides no other one
     document = tdhil("profiles", "check", "--json", path).document
     assert (document["ok"], document["exit_code"], len(document["problems"])) == (False, 2, 2)
     assert document["problems"][0]["line"] == at["highfirst"]
 
 
 @pytest.mark.parametrize("content", ["", "bus: profibus\n", "- a\n", "bus: canopen\neds: 3\n"])
-def test_no_traceback_whatever_the_file_is(tmp_path, content):
+def test_no_traceback_for_any_file(tmp_path, content):
     path = tmp_path / "mine.yaml"
     path.write_text(content)
     done = tdhil("profiles", "check", path)
@@ -149,8 +149,8 @@ def test_an_eds_that_is_not_there(tmp_path):
     assert "no file 'cia402.eds' beside" in done.err
 
 
-def test_a_profile_is_begun_from_an_eds(tmp_path, monkeypatch):
-    """Ours is an EDS like any other; what it can't say is named, nothing is overwritten, and the check likes it."""
+def test_a_profile_is_started_from_an_eds(tmp_path, monkeypatch):
+    """The shipped EDS is used. Missing entries are named, no file is overwritten, and the profile is valid."""
     monkeypatch.chdir(tmp_path)
     source = profile_path("generic/cia402").parent / "cia402.eds"
     done = tdhil("profiles", "import", source)
@@ -168,8 +168,8 @@ def test_a_profile_is_begun_from_an_eds(tmp_path, monkeypatch):
     assert (tmp_path / "mine.yaml").read_bytes() == before
 
 
-def test_a_real_drive_is_refused_what_an_eds_leaves_open(tmp_path):
-    """Before motion: every entry that the file can't know goes by its own name."""
+def test_a_real_drive_is_refused_for_entries_missing_in_an_eds(tmp_path):
+    """Before motion, every entry that the file does not contain needs its own override."""
     path = tmp_path / "mine.yaml"
     tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", path)
     profile = load_profile(str(path))
@@ -183,7 +183,7 @@ def test_a_real_drive_is_refused_what_an_eds_leaves_open(tmp_path):
 @pytest.mark.parametrize(("content", "at"), [
     ("[DeviceInfo]\nVendorNumber=\n", ":2: VendorNumber is empty"), ("", ": has no section [DeviceInfo]"),
 ])
-def test_a_broken_eds_is_a_line_and_no_profile(tmp_path, content, at):
+def test_a_damaged_eds_gives_one_line_and_no_profile(tmp_path, content, at):
     path = tmp_path / "drive.eds"
     path.write_text(content)
     done = tdhil("profiles", "import", path, "-o", tmp_path / "mine.yaml")
@@ -196,21 +196,21 @@ def test_a_broken_eds_is_a_line_and_no_profile(tmp_path, content, at):
 @pytest.mark.parametrize(("output", "words"), [
     ("mine.txt", "must end in .yaml"), ("no/such/mine.yaml", "can't be written"), ("no/such/mine.yaml", "TDH-206"),
 ])
-def test_where_a_profile_cannot_go(tmp_path, output, words):
+def test_invalid_destinations_of_a_profile(tmp_path, output, words):
     done = tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", tmp_path / output)
     assert done.code == 2
     assert words in done.err
 
 
 class Gone(io.StringIO):
-    """A pipe whose reader has enough: `tdhil profiles show … | head`."""
+    """Pipe whose reader closes early, as with `tdhil profiles show … | head`."""
 
     def write(self, text):
         raise BrokenPipeError(32, "Broken pipe")
 
 
 @pytest.mark.parametrize("command", [("profiles",), ("profiles", "show", "generic/modbus")])
-def test_a_reader_that_has_enough_is_no_mistake_of_ours(command, monkeypatch, capsys):
+def test_a_reader_that_closes_early_is_no_error(command, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdout", Gone())
     assert main([*command]) == 141
     assert capsys.readouterr().err == ""

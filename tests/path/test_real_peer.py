@@ -1,8 +1,8 @@
-"""A peer without the simulator's marker is taken for a real drive, which it can't be told from.
+"""Peer without the simulator's marker: it is treated as a real drive, since it cannot be distinguished from one.
 
-Nothing moves without limits and somebody's word. Real time, since a real shaft knows no other: the runs are ended by
-a signal as soon as they have shown what they were to show. A slow cycle and a long watchdog, so that a loaded
-machine's pauses are none to the drive.
+There is no motion without limits and a confirmation. The tests use real time, like a real shaft. A signal ends each run
+once the check is complete. Cycle and watchdog are slow, so that pauses of a loaded computer have no effect on the
+drive.
 """
 
 import signal
@@ -32,7 +32,7 @@ def drive(tmp_path):
 
 
 def assert_untouched(drive):
-    """Never enabled, never moved."""
+    """Assert that the drive was never enabled and the shaft never moved."""
     drive.child.terminate()
     drive.child.wait()
     shaft = drive.shaft
@@ -46,7 +46,7 @@ def enabled(drive):
 
 
 def at_rest_after(drive):
-    """What the shaft did, a little plant time after the host has gone."""
+    """Return the motion of the shaft, some plant time after the end of the host."""
     gone_s = tail_time(drive.trace)
     wait_for("some more rows", lambda: tail_time(drive.trace) > gone_s + 1.5)
     shaft = drive.shaft
@@ -77,7 +77,7 @@ def test_a_rig_without_limits_is_refused(tmp_path, drive):
 
 
 @pytest.mark.heavy
-def test_what_nobody_verified_is_refused_with_its_sources(tmp_path, drive, rig):
+def test_unverified_entries_are_refused_with_their_sources(tmp_path, drive, rig):
     rig.write_text(RIG.replace(ACCEPTED, ""))
     done = identify(tmp_path, *drive.options, "--rig", rig, "--yes")
     assert done.code == 4
@@ -137,7 +137,7 @@ def test_yes_replaces_the_prompt(tmp_path, drive, rig):
 
 @pytest.fixture
 def prompt(tmp_path, drive, rig):
-    """The run on a terminal, standing at the prompt."""
+    """Yield a run on a terminal that waits at the prompt."""
     with Terminal(sys.executable, "-m", "tdhil", "identify", *drive.options, "--rig", rig, cwd=tmp_path) as terminal:
         assert terminal.read_until("anything else to cancel:"), terminal.plain
         yield terminal
@@ -155,7 +155,7 @@ def test_a_wrong_word_moves_nothing(prompt, drive, answer):
     assert_untouched(drive)
 
 
-@pytest.mark.heavy      # no word at all: `without_a_terminal`, and tests/api/test_front_door.py
+@pytest.mark.heavy      # no word: see `without_a_terminal`, and tests/api/test_front_door.py
 def test_end_of_input_moves_nothing(prompt, drive):
     prompt.type("\x04")
     assert prompt.finish() == 4
@@ -179,7 +179,7 @@ def test_the_word_moves_the_shaft_and_the_prompt_fed_the_watchdog(prompt, drive)
     end = time.monotonic() + HANGS_S
     while tail_time(drive.trace) < before_s + 1.5 * PATIENT_S:
         assert time.monotonic() < end
-        prompt.read_until("anything else")            # somebody thinks for longer than the watchdog would wait
+        prompt.read_until("anything else")            # the operator decides for longer than the watchdog time
         time.sleep(0.05)
     assert not enabled(drive)
     prompt.type("MOVE\n")

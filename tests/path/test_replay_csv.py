@@ -1,4 +1,4 @@
-"""`tdhil replay trace.csv`: the same inertia from a run's log and from its samples in other people's dialects."""
+"""`tdhil replay trace.csv`: the same J from the log of a run and from its samples in other CSV dialects."""
 
 import math
 import re
@@ -23,7 +23,7 @@ DOC = Path(__file__).parents[2] / "docs" / "how-to" / "use-a-trace.md"
 
 @pytest.fixture(scope="module")
 def run(short_run, tmp_path_factory):
-    """A finished run, its Recording, and its excitation as a file."""
+    """Return a completed run, its Recording, and its excitation as a file."""
     folder, done = tmp_path_factory.mktemp("run"), short_run
     assert done.code == 0, done.err
     recording = read_run(done.log).recording
@@ -64,7 +64,7 @@ def parse(*words):
 
 @pytest.mark.heavy
 def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
-    """The first mean speed alone: by its options the same result, digit by digit, as by a file with this segment."""
+    """For the first mean speed only, the options give the same result, digit by digit, as a file with this segment."""
     _, recording, excitation, _ = run
     fresh = recording.fresh
     columns = (recording.time_s[fresh], recording.speed_rad_s[fresh],
@@ -90,7 +90,7 @@ def test_the_options_of_one_motion_replace_its_file(run, tmp_path):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("dialect", [plain, percent, german, american])
-def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
+def test_a_run_in_other_columns_and_units_has_the_same_inertia(run, tmp_path, dialect):
     document, recording, excitation, _ = run
     fresh = recording.fresh
     torque = recording.torque_nm[fresh] - recording.torque_offset_nm
@@ -115,7 +115,7 @@ def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
 @pytest.fixture
 def trace(run, tmp_path):
     _, recording, _, _ = run
-    path = tmp_path / "run.mcap"          # the name says nothing
+    path = tmp_path / "run.mcap"          # the name does not matter
     rows = zip(recording.time_s[::2], recording.speed_rad_s[::2], recording.torque_nm[::2], strict=True)
     path.write_text("time_s,speed_rad_s,torque_nm\n" + "".join(f"{t:.5f},{w:.6f},{m:.4f}\n" for t, w, m in rows))
     return path
@@ -135,7 +135,7 @@ def test_without_an_excitation_it_is_identified_from_the_motion_itself(run, trac
 
 
 @pytest.mark.heavy
-def test_a_trace_that_can_t_tell_says_which_motion_to_add(tmp_path):
+def test_an_unsuitable_trace_gives_advice_on_the_motion(tmp_path):
     path = tmp_path / "trace.csv"
     rng = np.random.default_rng(1)
     noise = rng.standard_normal((2, 2000))
@@ -149,7 +149,7 @@ def test_a_trace_that_can_t_tell_says_which_motion_to_add(tmp_path):
 
 
 @pytest.mark.heavy
-def test_what_is_known_of_the_bench_is_used(run, trace):
+def test_known_data_of_the_bench_are_used(run, trace):
     _, _, excitation, _ = run
     arguments = ("replay", "--json", trace, "--excitation", excitation)
     alone = tdhil(*arguments).document
@@ -193,12 +193,12 @@ def test_a_log_is_known_by_its_content(run, tmp_path):
     (("--tolerance", "0"), "--tolerance"),
     (("--torque-scale-sd", "2"), "--torque-scale-sd"),
     (("--speed-lag", "-1"), "--speed-lag"),
-    (("--speed-lag", "400"), "--speed-lag: 400 s: must be at least 0 and less than 60 s"),        # 400 ms were meant
+    (("--speed-lag", "400"), "--speed-lag: 400 s: must be at least 0 and less than 60 s"),        # 400 ms were intended
     (("--torque-lag-sd", "0.1"), "--torque-lag"),
     (("--excitation", "none.yaml"), "none.yaml"),
 ])
 def test_a_wrong_option_ends_with_2_and_names_what_is_wrong(tmp_path, arguments, said):
-    trace = tmp_path / "run.csv"          # its columns are right; that it shows no motion is never reached
+    trace = tmp_path / "run.csv"          # its columns are right; the check of the motion is not reached
     trace.write_text("time_s,speed_rad_s,torque_nm\n" + "".join(f"{0.01 * k:.2f},2.0,76.0\n" for k in range(100)))
     done = tdhil("replay", trace, *arguments)
     assert done.code == 2, done.err
@@ -208,7 +208,7 @@ def test_a_wrong_option_ends_with_2_and_names_what_is_wrong(tmp_path, arguments,
 
 
 @pytest.mark.heavy
-def test_the_file_may_stand_behind_the_columns(trace):
+def test_the_file_may_come_after_the_columns(trace):
     done = tdhil("replay", "--json", "--columns", "time=TIME_S", "speed=speed_rad_s", trace)
     assert done.code == 0
     assert done.document["log"] == str(trace)
@@ -228,7 +228,7 @@ def test_an_unusable_file_ends_with_10_in_one_line(tmp_path):
 # -- docs/how-to/use-a-trace.md ------------------------------------------------------------------------------
 
 
-def test_the_page_s_examples_do_what_it_says(tmp_path, monkeypatch):
+def test_the_examples_of_the_page_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = DOC.read_text(encoding="utf-8")
     files = re.findall(r"^<!-- file: (\S+)[^\n]*-->\n```\w+\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Replays of runs that ended before their time: what came before the abort counts, and what ended the run is said."""
+"""Replays of aborted runs: only data before the abort count, and the result states the cause of the abort."""
 
 import shutil
 
@@ -30,7 +30,7 @@ def test_an_aborted_run_is_a_partial_result(sto):
 
 
 @pytest.mark.heavy
-def test_so_is_its_recovered_copy(sto, tmp_path):
+def test_its_recovered_copy_is_a_partial_result(sto, tmp_path):
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     shutil.copy(sto.log, cut)
     with cut.open("r+b") as file:

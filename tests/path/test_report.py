@@ -1,4 +1,4 @@
-"""`--report`: one page, the same from a run and from its replay, and never in the way of either."""
+"""`--report`: one page, equal from a run and from its replay, without an effect on either."""
 
 from datetime import datetime
 from hashlib import sha256
@@ -23,7 +23,7 @@ def run(tmp_path_factory):
 
 
 @pytest.mark.heavy
-def test_a_run_has_a_second_opinion_and_a_friction_curve(run):
+def test_a_run_has_cross_checks_and_a_friction_curve(run):
     opinions = run.document["second_opinions"]
     assert [opinion["route"] for opinion in opinions] == ["speed change"]
     assert opinions[0]["inertia_kg_m2"]["low"] < 104.0 < opinions[0]["inertia_kg_m2"]["high"]
@@ -47,7 +47,7 @@ def test_the_replay_gives_the_same_page_and_the_same_numbers_to_the_last_bit(run
 
 
 @pytest.mark.heavy
-def test_json_says_when_on_what_and_by_whom(run):
+def test_json_has_time_drive_and_program(run):
     found = run.document
     assert datetime.fromisoformat(found["date"]).utcoffset() is not None
     assert (found["operator"], found["note"]) == ("A. Person", "after the repair")
@@ -60,7 +60,7 @@ def test_json_says_when_on_what_and_by_whom(run):
 
 
 @pytest.mark.heavy
-def test_a_pdf_is_written_where_the_name_says_so(run):
+def test_a_pdf_is_written_for_a_name_with_pdf(run):
     page = run.log.parent / "report.PDF"
     assert tdhil("replay", run.log, "--report", page).code == 0
     before = page.read_bytes()
@@ -72,7 +72,7 @@ def test_a_pdf_is_written_where_the_name_says_so(run):
 
 
 @pytest.mark.parametrize(("name", "said"), [("run.mcap", "the log itself"), ("no/r.html", "no such folder")])
-def test_a_place_where_no_report_can_go_is_refused_before_anything_moves(tmp_path, name, said):
+def test_an_unwritable_place_of_a_report_is_refused_before_motion(tmp_path, name, said):
     done = identify(tmp_path, "--simulate", "--report", tmp_path / name)
     assert done.code == 2
     assert said in done.err
@@ -80,7 +80,7 @@ def test_a_place_where_no_report_can_go_is_refused_before_anything_moves(tmp_pat
 
 
 @pytest.mark.heavy
-def test_the_log_is_never_written_over_by_its_own_report(run):
+def test_a_report_never_overwrites_its_log(run):
     before = run.log.read_bytes()
     done = tdhil("replay", run.log, "--report", run.log)
     assert done.code == 2

@@ -1,4 +1,4 @@
-"""`tdhil scan`: who is there, which profile may be his, and what is said when nobody answers."""
+"""`tdhil scan`: found drives, matching profiles, and messages without a reply."""
 
 import re
 import threading
@@ -23,12 +23,12 @@ from tests.path.scan_lines_scripted import Answering, Garbled, Silent
 from tests.path.watched_bus import WatchedBus
 from tests.rigs import NUMBERS, rig_file
 
-pytestmark = pytest.mark.real_time         # who is asked has so long to answer, on the wall's clock
+pytestmark = pytest.mark.real_time         # time-out of a reply, wall time
 QUICK = ("--listen", 0.5)
 
 
 def filled(path):
-    """The starter file as an engineer would complete it: '#' away, and a value behind each key."""
+    """Return the completed starter file: without '#', and with a value after each key."""
     text = re.sub(r"^#( *[a-z_0-9]+:)", r"\1", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
     text = re.sub(r"^(name:)", r"\1 bench 3", text, flags=re.MULTILINE)
     for name, value in (NUMBERS | {"torque_scale_rel_sd": 0.02, "rated_torque_nm": 1000.0}).items():
@@ -42,7 +42,7 @@ def filled(path):
 # -- CANopen -------------------------------------------------------------------------------------------------
 
 
-def test_a_node_says_who_it_is(tmp_path):
+def test_a_node_reports_its_identity(tmp_path):
     with EmbeddedSimulator(RigParams(), node_id=42, stepped=True) as simulated:
         done = tdhil("scan", "-i", "virtual", "-c", simulated.channel, *QUICK)
         document = tdhil("scan", "-i", "virtual", "-c", simulated.channel, *QUICK, "--json").document
@@ -89,7 +89,7 @@ def test_two_nodes_and_a_starter_for_one_of_them(tmp_path):
     assert not (tmp_path / "a.yaml").exists()
     assert chosen.code == 0, chosen.err
     text = (tmp_path / "b.yaml").read_text(encoding="utf-8")
-    assert load_rig(tmp_path / "b.yaml").limits is None            # as it is, nothing real moves with it
+    assert load_rig(tmp_path / "b.yaml").limits is None            # unchanged, it permits no motion of a real drive
     with pytest.raises(PreflightRefused):
         require_limits(load_rig(tmp_path / "b.yaml"))
     rig = filled(tmp_path / "b.yaml")
@@ -99,7 +99,7 @@ def test_two_nodes_and_a_starter_for_one_of_them(tmp_path):
     assert "(SIMULATED)" in text
 
 
-def test_a_file_that_is_there_is_never_written_over(tmp_path):
+def test_an_existing_file_is_never_overwritten(tmp_path):
     path = rig_file(tmp_path, "node: 3\n")
     done = tdhil("scan", "--simulate", *QUICK, "--write", path)
     assert done.code == 2
@@ -115,7 +115,7 @@ def test_nobody_there(monkeypatch):
     assert len(done.err.splitlines()) == 1
 
 
-def test_nowhere_to_look():
+def test_no_bus_is_named():
     done = tdhil("scan")
     assert done.code == 2
     assert "no CAN bus is configured" in done.err
@@ -123,7 +123,7 @@ def test_nowhere_to_look():
 
 
 class ErrorFrames:
-    """What an adapter shows at a wrong bit rate: error frames, and no answer."""
+    """Adapter at a wrong bit rate: error frames, and no reply."""
 
     channel_info = "an adapter"
 
@@ -147,7 +147,7 @@ class ErrorFrames:
 
 
 class Full(ErrorFrames):
-    """Nobody acknowledges: the transmit queue stays full (ENOBUFS)."""
+    """Bus without an acknowledgement: the transmit queue stays full (ENOBUFS)."""
 
     def send(self, message, timeout=None):
         raise can.CanOperationError("No buffer space available", 105)
@@ -197,16 +197,16 @@ def test_the_embedded_modbus_drive(tmp_path):
     assert require_limits(rig).speed_max_rad_s == 10.0
 
 
-def test_a_profile_that_was_named_stands_in_the_starter(tmp_path):
+def test_a_named_profile_is_in_the_starter(tmp_path):
     done = tdhil("scan", "--simulate", "--profile", "siemens/g120", "--write", tmp_path / "rig.yaml")
     assert done.code == 0, done.err
     text = (tmp_path / "rig.yaml").read_text(encoding="utf-8")
     assert "profile: siemens/g120    # as given: --profile" in text
-    assert "# - p1300" in text                                    # what to set at the drive
+    assert "# - p1300" in text                                    # settings at the drive
     assert filled(tmp_path / "rig.yaml").profile == "siemens/g120"
 
 
-def test_a_serial_line_is_asked_at_the_usual_settings_until_somebody_answers(tmp_path, monkeypatch):
+def test_a_serial_line_is_scanned_at_the_usual_settings_until_a_reply(tmp_path, monkeypatch):
     opened = []
 
     def open_wire(line, clock):
@@ -216,7 +216,7 @@ def test_a_serial_line_is_asked_at_the_usual_settings_until_somebody_answers(tmp
     monkeypatch.setattr(modbus, "open_wire", open_wire)
     done = tdhil("scan", "--serial", "/dev/ttyUSB9", "--units", "2-4", "--write", tmp_path / "rig.yaml")
     assert done.code == 0, done.err
-    assert opened[0] == (115200, "E", 1)                          # as the profile has it
+    assert opened[0] == (115200, "E", 1)                          # as in the profile
     assert opened[-1] == (9600, "N", 1)
     assert "unit 3: FC 302 · SIMULATED" not in done.out
     assert "unit 3: FC 302" in done.out
@@ -224,10 +224,10 @@ def test_a_serial_line_is_asked_at_the_usual_settings_until_somebody_answers(tmp
     rig = filled(tmp_path / "rig.yaml")
     line = rig.modbus
     assert (line.serial, line.baud, line.parity, line.stop_bits, line.unit) == ("/dev/ttyUSB9", 9600, "N", 1, 3)
-    assert rig.profile == "generic/modbus"                        # which the engineer chose: nothing fitted
+    assert rig.profile == "generic/modbus"                        # chosen by the engineer: no profile matched
 
 
-def test_what_is_said_of_the_line_is_not_tried_otherwise(monkeypatch):
+def test_stated_settings_of_the_line_are_not_varied(monkeypatch):
     opened = []
 
     def open_wire(line, clock):
@@ -249,7 +249,7 @@ def test_garbled_replies_point_to_the_line(monkeypatch):
     assert "parity" in done.err
 
 
-def test_nobody_listens(monkeypatch):
+def test_no_server(monkeypatch):
     done = tdhil("scan", "--host", "127.0.0.1", "--port", 1)
     assert done.code in (4, 5)
     assert "127.0.0.1:1" in done.err
@@ -262,23 +262,23 @@ def test_unit_numbers(text, units):
 
 
 @pytest.mark.parametrize("text", ["", "1-", "a", "5-2", "256", "-1"])
-def test_unit_numbers_that_are_none(text):
+def test_invalid_unit_numbers(text):
     with pytest.raises(ValueError):
         parse_units(text)
     assert tdhil("scan", "--drive", "modbus", "--simulate", f"--units={text or 'x'}").code == 2
 
 
-def test_device_identification_is_read_as_the_specification_lays_it_out():
-    """Modbus Application Protocol V1.1b3, section 6.21: MEI 0Eh, code 01, conformity 01, nothing more, 3 objects."""
+def test_device_identification_is_read_as_in_the_specification():
+    """The reply of section 6.21 has MEI 0Eh, code 01, conformity 01, no more to follow, 3 objects (V1.1b3)."""
     pdu = bytes.fromhex("2b 0e 01 01 00 00 03") + b"\x00\x07Danfoss" + b"\x01\x06FC 302" + b"\x02\x038.1"
     assert parse_identification(pdu) == ("Danfoss", "FC 302", "8.1")
     for size in range(len(pdu)):
-        parse_identification(pdu[:size])                          # cut anywhere, it is no error
+        parse_identification(pdu[:size])                          # truncated anywhere, it is no error
     assert parse_identification(bytes((0xAB, 1))) == ("", "", "")
 
 
 @pytest.mark.parametrize("name", profile_names())
-def test_a_starter_loads_for_every_profile_as_it_is_and_filled_in(tmp_path, name):
+def test_a_starter_loads_for_every_profile_unchanged_and_completed(tmp_path, name):
     profile = load_profile(name)
     found = FoundDrive(profile.bus, 7, "drive", "vendor 1h", False, name, "why")
     path = tmp_path / "rig.yaml"

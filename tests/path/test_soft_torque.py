@@ -1,6 +1,6 @@
-"""Tuned gains on the simulated drive, through CANopen frames in stepped time: a bit that sticks, and one that turns.
+"""Tuned gains on the simulated drive, by CANopen frames in stepped time: a bit that sticks, and one that turns.
 
-The string that the simulated drive turns and the one that its gains are tuned on share no code.
+The string of the simulated drive and the string of the tuning share no code.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ SET_RPM, RAMP_RPM_S, SECONDS = 100.0, 4.0, 85.0
 
 @pytest.fixture(scope="module")
 def tuned():
-    """Stiff and soft, for the machine that plant.yaml describes; its loop has 20 and 10 ms of lag, and its steps."""
+    """Return stiff and soft gains for the machine of plant.yaml, with lags of 20 and 10 ms and its sampling."""
     return gains()
 
 
 def gains():
-    """By their kind."""
+    """Return the gains by kind."""
     drive = TopDrive(1500.0, 8.0, 60.0, (0.020, 0.010, 0.003))
     case = TuneCase(load_string(EXAMPLES / "string.yaml"), drive, Interval(1500.0, 1440.0, 1560.0))
     return {one.kind: one.controller for one in tune(case, search=None).tuned}
 
 
 def rig_with(tmp_path, law):
-    """As `tdhil simulate canopen --plant … --gains P I` makes it: the example, on 3,000 m."""
+    """Return the rig of `tdhil simulate canopen --plant … --gains P I`: the example with 3,000 m."""
     text = (EXAMPLES / "plant_stick_slip.yaml").read_text(encoding="utf-8")
     plant = plant_file(tmp_path, text.replace("kind: string\n", "kind: string\n  length_m: 3000.0\n", 1))
     parser = argparse.ArgumentParser()
@@ -53,7 +53,7 @@ def rig_with(tmp_path, law):
 
 
 def turned(rig, set_rpm=SET_RPM, seconds=SECONDS, trace=None):
-    """The set speed ramped up over the bus: times, true speed of the bit, reported speed of the top; rad/s."""
+    """Ramp the set speed over the bus; return times, true speed of the bit, reported speed of the top, rad/s."""
     simulated = InlineSimulator(rig, seed=5).open()
     profile = load_canopen_profile("generic/cia402")
     drive = CanopenDrive(simulated.station(), profile, SteppedClock(), node=1, rate_hz=25.0)
@@ -92,7 +92,7 @@ def test_the_bit_sticks_under_the_stiff_gains_and_turns_under_the_soft_ones(tune
         assert bit[late].max() < 1.1 * SET_RPM * RPM
 
 
-def test_gains_that_are_none_are_refused(tmp_path, capsys):
+def test_invalid_gains_are_refused(tmp_path, capsys):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     for words in (["--gains", "300"], ["--gains", "-1", "3"], ["--gains", "nan", "3"]):

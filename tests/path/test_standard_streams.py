@@ -1,4 +1,4 @@
-"""stdout and stderr that are closed, full or speak ASCII only: the run ends as it should, and its result isn't lost."""
+"""stdout and stderr that are closed, full or ASCII only: the run ends normally, and its result is not lost."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FULL = "/dev/full"
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory):
-    """A whole run, whose stdout is full: (exit code, stderr, log). What is printed at its end a replay prints too."""
+    """Return (exit code, stderr, log) of a whole run with a full stdout. A replay prints the same end."""
     log, err = tmp_path_factory.mktemp("streams") / "run.mcap", io.StringIO()
     with (
         pytest.MonkeyPatch.context() as patch,
@@ -38,7 +38,7 @@ def ended(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def once():
-    """`identify`, whose work is done once: all replays here are of one log, and differ in where they print."""
+    """Identify once for all tests: all replays here are of one log and differ in their output streams."""
     kept = {}
 
     def identified(recording, options):
@@ -77,7 +77,7 @@ def test_an_encoding_that_lacks_our_signs(log, monkeypatch, encoding, arguments)
     assert ("kg" in text) if not arguments else (text.count("{") == text.count("}") > 5)
     if encoding == "ascii" and not arguments:
         assert "kg.m2" in text and "+-" in text
-        assert {len(line) for line in text.splitlines()} == {80}      # the frame's right edge stays a line
+        assert {len(line) for line in text.splitlines()} == {80}      # the right edge of the frame stays a line
 
 
 @pytest.mark.heavy
@@ -92,7 +92,7 @@ def test_a_full_device(log, monkeypatch):
 
 @pytest.mark.heavy
 def test_a_replay_into_a_closed_pipe_prints_nothing_else(log):
-    """``tdhil replay run.mcap | head -n 1``: the reader has read enough."""
+    """The reader closes early, as with ``tdhil replay run.mcap | head -n 1``."""
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run([sys.executable, "-m", "tdhil", "replay", str(log)], stdout=writing, stderr=subprocess.PIPE,
@@ -137,13 +137,13 @@ def test_neither_stdout_nor_stderr(log, monkeypatch):
 
 
 @pytest.mark.parametrize("buffering", [1, -1])
-def test_a_dead_stderr_takes_no_cause_with_it(monkeypatch, tmp_path, buffering):
+def test_a_dead_stderr_hides_no_cause(monkeypatch, tmp_path, buffering):
     with open(FULL, "w", encoding="utf-8", buffering=buffering) as stderr:  # noqa: PTH123
         assert run(monkeypatch, io.StringIO(), "replay", tmp_path / "none.mcap", stderr=stderr)[0] == 2
 
 
 @pytest.mark.heavy
-def test_closed_descriptors_are_given_to_no_file():
+def test_closed_descriptors_are_not_reused_by_files():
     script = "import os, sys; os.close(1); os.close(0)\n" \
              "from tdhil.cli.main import main; main(['profiles', 'show', 'nothing'])\n" \
              "sys.exit(0 if min(os.open('/dev/null', 0), 9) > 2 else 1)"
@@ -161,7 +161,7 @@ def test_ctrl_c_while_a_command_is_being_loaded(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOSPC, errno.EIO, errno.ENOMEM])
-def test_what_the_system_refuses_is_said_in_one_line(monkeypatch, capsys, number):
+def test_a_refusal_of_the_system_gives_one_line(monkeypatch, capsys, number):
     def refused(_):
         raise OSError(number, "the system's word")
 
@@ -179,7 +179,7 @@ def test_an_unknown_model_in_a_log():
 @pytest.mark.heavy
 @pytest.mark.parametrize("fault", [(), ("--fault", "sto@hold+1s")])
 def test_nothing_is_loaded_once_the_shaft_may_move(tmp_path, fault):
-    """Later there may be no descriptor left to load it with, or no disk."""
+    """Later there may be no free descriptor or no disk for an import."""
     script = f"""
 import sys
 from tdhil.session import confirm

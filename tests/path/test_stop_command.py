@@ -1,4 +1,4 @@
-"""`tdhil stop`: against drives in a process of their own, turned by somebody else, dead, or gone mad."""
+"""`tdhil stop` on drives in their own process: turned by another master, dead, or faulty."""
 
 import signal
 import socket
@@ -22,7 +22,7 @@ def stop(drive, *arguments):
 
 
 class Master:
-    """Another master: enables, turns the shaft, and (``stubborn``) goes on with its RPDO and SYNC whatever happens."""
+    """Other master that enables and turns the shaft. With ``stubborn`` it never stops its RPDO and SYNC."""
 
     def __init__(self, drive):
         from drivers.canopen.bus import CanLink
@@ -34,7 +34,7 @@ class Master:
                            port=int(options["port"]), tcp_tune=True)
         self.link = CanLink(self.bus, MonotonicClock())
         self.objects = SdoObjects(self.link, NODE)
-        self.patient = self.objects.answered_within(30.0)       # a drive on a busy computer answers when it can
+        self.patient = self.objects.answered_within(30.0)       # a drive on a busy computer replies late
 
     def __enter__(self):
         self.patient.__enter__()
@@ -64,7 +64,7 @@ def turning(tmp_path):
         yield drive, master
 
 
-def test_a_turning_shaft_is_brought_to_rest_and_never_disabled(turning):
+def test_a_turning_shaft_is_stopped_and_never_disabled(turning):
     drive, master = turning
     master.turn()
     done = stop(drive, "--json")
@@ -77,11 +77,11 @@ def test_a_turning_shaft_is_brought_to_rest_and_never_disabled(turning):
     assert master.state() == 0x07
     shaft = drive.shaft
     assert abs(shaft.speed_rad_s[-1]) < 0.05
-    assert shaft.state[-1] == "quick stop active"      # held, not let go
+    assert shaft.state[-1] == "quick stop active"      # enabled, not disabled
 
 
 @pytest.mark.heavy
-def test_a_drive_that_is_off_already_is_left_alone(turning):
+def test_a_drive_that_is_already_disabled_is_not_changed(turning):
     drive, _ = turning
     done = stop(drive)
     assert done.code == 0
@@ -101,8 +101,8 @@ def test_a_quick_stop_that_would_coast_is_replaced_first(turning):
 
 
 @pytest.mark.heavy
-def test_while_a_run_of_ours_is_under_way(tmp_path):
-    """Two masters, three processes: the run sees its drive taken from it, and ends by its own stop."""
+def test_a_stop_during_a_run_of_tdhil(tmp_path):
+    """With two masters in three processes, the run finds the other master and ends with its own stop."""
     rig = rig_file(tmp_path, "rate_hz: 4\n", PATIENT_LIMITS)
     with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
         assert running.wait_for_line("stage speed …"), running.err
@@ -113,7 +113,7 @@ def test_while_a_run_of_ours_is_under_way(tmp_path):
         shaft = drive.shaft
     assert done.code == 0, done.out
     assert "another master is on the bus" in done.out
-    assert ended.code in (5, 6, 8), ended.err        # 5: the run saw a second master at work
+    assert ended.code in (5, 6, 8), ended.err        # 5: the run found another master
     assert abs(shaft.speed_rad_s[-1]) < 0.05
     shaft.assert_never_let_go()
 
@@ -136,7 +136,7 @@ while True:
 
 
 @pytest.mark.heavy
-def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
+def test_a_master_that_enables_repeatedly_loses_its_rpdo(turning):
     drive, master = turning
     master.objects.write(0x1400, 1, 0x80000201, 32)
     master.objects.write(0x1600, 0, 0, 8)
@@ -157,7 +157,7 @@ def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
 
 
 @pytest.mark.heavy
-def test_nobody_answers(tmp_path):
+def test_no_reply(tmp_path):
     with peer(tmp_path, *REAL_TIME) as drive:
         done = tdhil("stop", *drive.options, "--node", 5)
     assert done.code == 8
@@ -175,9 +175,9 @@ HUB = ("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1")
     pytest.param((), id="text"), pytest.param(("--json",), id="json", marks=pytest.mark.heavy),
 ])
 def test_where_nobody_is_reached(dead, as_json, no_bus_of_the_user):
-    """Whatever stands between here and the drive: 8 and the sentence, never a mere connection error."""
+    """Any fault of the connection gives exit 8 and the message on the stop, not only a connection error."""
     with socket.create_server(("127.0.0.1", 0)) as listening, socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))           # and nobody else listens there meanwhile
+        taken.bind(("127.0.0.1", 0))           # and no other server uses this port
         mute, closed = listening.getsockname()[1], taken.getsockname()[1]
         line = {
             "closed Modbus port": (*MODBUS_TCP, closed), "silent Modbus host": (*MODBUS_TCP, mute),
@@ -212,7 +212,7 @@ def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
     monkeypatch.setattr(quick_stop, "NO_SLOWER_S", 1.0)
     drive, master = turning
     master.turn(speed_lsb=800)
-    master.objects.write(0x6085, 0, 1, 32)             # as good as no deceleration: 0.1 rpm/s
+    master.objects.write(0x6085, 0, 1, 32)             # nearly no deceleration: 0.1 rpm/s
     monkeypatch.setattr(quick_stop, "SLOWER", 0.5)
     done = stop(drive)
     assert done.code == 8
@@ -232,7 +232,7 @@ def test_a_stepped_drive_whose_host_has_died_is_stopped_too(tmp_path):
     assert done.code == 0, done.out
 
 
-def test_without_a_bus_it_says_what_to_name():
+def test_without_a_bus_it_names_the_required_options():
     done = tdhil("stop")
     assert done.code == 2
     assert "--host" in done.err
@@ -243,9 +243,9 @@ def test_without_a_bus_it_says_what_to_name():
 def test_ctrl_c_ends_the_watching_only(turning, number):
     drive, master = turning
     master.turn()
-    master.objects.write(0x6085, 0, 120, 32)           # slowly, so that there is something left to watch
+    master.objects.write(0x6085, 0, 120, 32)           # slowly, so that the watch lasts
     with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stderr=-1) as child:
         assert wait_for("stop", lambda: master.state() == 0x07)
         child.send_signal(number)
-        assert child.wait(HANGS_S) in (8, -2)      # not confirmed: a script must not take it for a stop
+        assert child.wait(HANGS_S) in (8, -2)      # not confirmed: a script must not count it as a stop
     assert wait_for("rest", lambda: abs(master.objects.read(0x606C, signed=True)) < 5)

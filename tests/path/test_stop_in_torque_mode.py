@@ -1,4 +1,4 @@
-"""A drive that ignores the change to speed mode at the stop, and whose quick stop lets a shaft in torque mode go.
+"""Drive that ignores the change to speed mode at the stop, and whose quick stop coasts in torque mode.
 
 The true shaft is read from the trace: friction stops it, and the drive is disabled at standstill only.
 """
@@ -21,7 +21,7 @@ KEEPS_MODE = ("--fault", "mode-not-followed@hold")
 
 
 def stopped(folder, generic, *arguments):
-    """Run against a drive that keeps to the generic profile, but for a quick stop that lets go in torque mode."""
+    """Run with a drive of the generic profile whose quick stop coasts in torque mode."""
     text = profile_path(generic).read_text(encoding="utf-8").replace(f"name: {generic}", "name: own/lets-go")
     text = text.replace("decelerates_in_torque_mode: true", "decelerates_in_torque_mode: false")
     text = text.replace("eds: cia402.eds", "eds: null")
@@ -49,13 +49,13 @@ BUSES = [
 def test_friction_stops_the_shaft_before_the_drive_is_disabled(tmp_path, generic):
     shaft = stopped(tmp_path, generic, *QUICK, "--periods", 3)
     shaft.assert_at_rest()
-    assert not shaft.events("state: quick stop active"), "its quick stop would have let go"
+    assert not shaft.events("state: quick stop active"), "its quick stop would have disabled it"
 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("generic", BUSES)
 def test_the_torque_of_a_string_comes_down_on_the_ramp(tmp_path, generic):
-    """The bit and the mud hold the string back, so that it is wound up while it turns."""
+    """Bit and mud load the string, so that it is twisted while it turns."""
     rig = rig_file(tmp_path, "rate_hz: 50\n", LIMITS, STRING.replace("400", f"{RAMP_NM_S}"))
     rough = yaml.safe_load((EXAMPLES / "plant_two_mass.yaml").read_text(encoding="utf-8"))
     rough["plant"]["bottom"] |= {"coulomb_nm": 800.0, "viscous_nm_s_rad": 60.0}
@@ -66,11 +66,11 @@ def test_the_torque_of_a_string_comes_down_on_the_ramp(tmp_path, generic):
     torques = [float(shaft.torque_nm[k]) for k in seconds]
     begun = max(k for k, torque in enumerate(torques) if torque > 4.0 * 0.02 * TORQUE_NM)
     ramp = torques[begun - 2:begun + 2]
-    # Seen every second; the torque of the simulated drive has noise.
+    # Checked every second, since the torque of the simulated drive has noise.
     assert all(0.0 < before - after < 1.7 * RAMP_NM_S for before, after in pairwise(ramp)), ramp
     last = shaft.time_s > shaft.time_s[off] - 1.0
     held = [state in HELD for state in shaft.state]
     assert abs(shaft.torque_nm[last & held].mean()) < 0.02 * TORQUE_NM
-    # It yields to the string no faster than a release does.
+    # It yields to the string no faster than a release.
     assert shaft.speed_rad_s.min() > -0.1 * SPEED_RAD_S
     assert abs(shaft.speed_rad_s[off:]).max() < 0.05

@@ -1,4 +1,4 @@
-"""Stopping a simulated drill string through the whole path: wound up, swinging, or stuck at the bottom."""
+"""Stop of a simulated drill string on the whole path: twisted, oscillating, or stuck at the bottom."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def string_rig(folder, speed, torque, probe, ramp, time):
     [("plant_two_mass.yaml", 10.0, 4000.0, 2000.0, 2.0, 14.0), ("plant_string.yaml", 10.0, 4000.0, 2000.0, 2.0, 14.0),
      ("plant_stick_slip.yaml", 22.0, 15000.0, 8000.0, 3.0, 25.0)],
 )
-def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, plant, speed, torque, probe, ramp, time):
+def test_a_string_is_stopped_and_released_before_a_disable(tmp_path, plant, speed, torque, probe, ramp, time):
     rig, trace = string_rig(tmp_path, speed, torque, probe, ramp, time), tmp_path / "shaft.csv"
     done = identify(
         tmp_path, "--simulate", "--seed", 3, "--plant", EXAMPLES / plant, "--rig", rig, "--trace", trace
@@ -34,18 +34,18 @@ def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, p
     off = max(k for k, state in enumerate(shaft.state) if state in HELD)
     stopped = [k for k, time_s in enumerate(shaft.time_s[:off]) if time_s > time]
     residual_nm = max(0.02 * torque, 5.0 * 0.001 * 20000.0 if "stick" in plant else 50.0)
-    # Over the last second under power the drive holds next to nothing, and the shaft does not turn.
+    # In its last second of operation the drive has nearly no torque, and the shaft does not turn.
     last = shaft.time_s[off] - 1.0
     held = [(t, w) for s, t, w in zip(shaft.time_s[:off], shaft.torque_nm, shaft.speed_rad_s, strict=False) if s > last]
     assert abs(sum(t for t, _ in held) / len(held)) < 2.0 * residual_nm
     assert max(abs(w) for _, w in held) < 0.15
-    # Afterwards it stays where it is.
+    # Afterwards it does not move.
     assert max(abs(w) for w in shaft.speed_rad_s[off:]) < 0.05
-    # And it was wound up: the way to rest went through far more torque than that.
+    # The string was twisted: the torque before was much larger.
     assert max(abs(shaft.torque_nm[k]) for k in stopped) > 4.0 * residual_nm
 
 
-def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
+def test_the_example_of_a_string_stops_without_a_rig_file(tmp_path):
     from sim_bus.params import RigParams
     from sim_bus.params import load_rig as load_plant
     from tdhil.config.rig import Rig, load_rig

@@ -1,8 +1,8 @@
-"""Whatever ends a run, the true shaft comes to rest within what the settings allow, and stays there.
+"""Ends of a run: the true shaft comes to standstill within the time of the settings, and stays there.
 
-Two processes, stepped time. The times are the plant's own, from the simulator's trace: what the host believes and
-how long a test took on the wall don't count. A signal is sent when stderr names the stage; where the run was so quick
-that the signal came a stage late, it is run again.
+The tests use two processes and stepped time. Times are plant times from the simulator's trace, independent of the host
+and of wall time. A signal is sent when stderr names the stage. If the run was so quick that the signal came in the
+next stage, it is repeated.
 """
 
 import os
@@ -34,13 +34,13 @@ from tests.path.path_runs import (
 from tests.rigs import PATIENT_LIMITS, rig_file
 
 CYCLE_S = 0.02
-LONG = (*QUICK, "--periods", 40)      # no stage 5 ends before the signal is there
+LONG = (*QUICK, "--periods", 40)      # no stage 5 ends before the signal arrives
 STEPPED = ("--stepped", "--seed", 1)
 TRIES = 4
 
 
 def reached(drive, running, stage):
-    """Wait until the shaft has been under way in a stage; False if the run was over before."""
+    """Wait until the shaft moves in a stage; return False if the run ended before."""
     if not running.wait_for_line(f"stage {stage} …"):
         return False
     if stage == "setup":
@@ -58,7 +58,7 @@ SELDOM = {
     ("SIGINT", "setup"): HEAVY, ("SIGINT", "acquire"): HEAVY, ("SIGINT twice", "acquire"): ALWAYS,
     ("SIGINT", "speed"): HEAVY, ("SIGINT", "torque"): HEAVY, ("SIGTERM", "speed"): HEAVY,
 }
-"""What a signal and a stage are marked with; those that aren't here are long."""
+"""Marks of a signal and a stage. All other combinations are long."""
 
 
 @pytest.mark.heavy
@@ -93,7 +93,7 @@ def test_a_signal_in_each_stage(tmp_path, how, stage):
 
 
 def assert_stopped(shaft, done):
-    """From the wish to the quick stop a few cycles, from there the ramp; then rest, and torque off."""
+    """Assert a few cycles from the request to the quick stop, then the ramp, standstill, and the disabled drive."""
     begun_s = shaft.assert_stopped_within_settings()
     (asked_s,) = [event.time_s for event in read_run(done.log).events if event.kind == "interrupted"]
     assert begun_s - asked_s <= 3 * CYCLE_S
@@ -101,7 +101,7 @@ def assert_stopped(shaft, done):
     assert done.document["error"]["kind"] == "Interrupted"
     replayed = tdhil("replay", "--json", done.log)
     assert replayed.code in (3, 9)
-    if aborted_stage(done.log) == ["setup"]:           # nothing to identify from
+    if aborted_stage(done.log) == ["setup"]:           # no data for an identification
         assert replayed.document["error"]["kind"] == "NothingRecorded"
     else:
         assert replayed.document["stages"] == done.document["stages"] or replayed.document["complete"]
@@ -110,14 +110,14 @@ def assert_stopped(shaft, done):
 @pytest.mark.heavy
 @pytest.mark.real_time
 def test_ctrl_c_in_real_time(tmp_path):
-    """The embedded simulator against the wall clock; a slow cycle and a long watchdog bear a loaded machine."""
+    """The embedded simulator runs in real time. A slow cycle and a long watchdog tolerate a loaded computer."""
     rig, trace = rig_file(tmp_path, "rate_hz: 4\n", PATIENT_LIMITS), tmp_path / "shaft.csv"
     with host(tmp_path, "--simulate", "--real-time", "--seed", 1, "--trace", trace, "--rig", rig) as running:
         assert running.wait_for_line("stage speed …"), running.err
         running.signal(signal.SIGINT)
         done = running.finish()
     assert done.code == 130, done.err
-    # Late cycles of a loaded machine mark the stage as degraded; that it was run through is what counts here.
+    # Late cycles of a loaded computer mark the stage as degraded. The stage must only be complete here.
     assert done.outcomes[0] in [("setup", "ok"), ("setup", "degraded")]
     assert done.outcomes[1:] == [("speed", "aborted")]
     shaft = Shaft.read(trace)
@@ -132,7 +132,7 @@ def test_ctrl_c_in_real_time(tmp_path):
 def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage):
     with peer(tmp_path, *STEPPED) as drive, host(tmp_path, *drive.options, "--stepped", *LONG) as running:
         assert reached(drive, running, stage), running.err
-        if stage == "speed":        # past its ramp up from rest
+        if stage == "speed":        # after its ramp from standstill
             wait_for("speed", lambda: tail_time(drive.trace) > 12.0, running.child)
         running.signal(signal.SIGKILL)
         done = running.finish()
@@ -146,13 +146,13 @@ def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage)
     assert replayed.document["complete"] is False
     inertia = replayed.document["inertia_kg_m2"]
     assert (replayed.code == 3) == (inertia is not None)
-    if inertia is not None:         # the ramps of stages 2 and 3 tell something of J too, and say how little
+    if inertia is not None:         # the ramps of stages 2 and 3 also give J, with its uncertainty
         assert inertia["low"] <= INERTIA <= inertia["high"]
 
 
 def assert_stopped_by_watchdog(shaft):
     silent_s = shaft.assert_stopped_by_watchdog(CYCLE_S)
-    # Until then the last setpoint goes on acting: at most the torque limit on the bare inertia, and as it fades away.
+    # Until then the last setpoint acts: at most the torque limit on the inertia, and the decay of the torque.
     fastest = shaft.speed_at(silent_s) + (WATCHDOG_S + CYCLE_S) * TORQUE_NM / INERTIA + SWINGS_IN_RAD_S
     after = shaft.time_s >= silent_s
     assert shaft.speed_rad_s[after].max() <= fastest
@@ -174,7 +174,7 @@ def test_a_run_killed_late_in_acquire_is_replayed_as_a_partial_result(tmp_path):
                         running.child):
                 running.signal(signal.SIGKILL)
             done = running.finish()
-            if "stage acquire ok" in done.err:          # it was over before the signal came
+            if "stage acquire ok" in done.err:          # it ended before the signal
                 continue
             assert done.code == -signal.SIGKILL, done.err
             wait_for("the end of the stop", drive.rests_after_watchdog)
@@ -196,7 +196,7 @@ def test_a_run_killed_late_in_acquire_is_replayed_as_a_partial_result(tmp_path):
 
 @pytest.mark.long       # tests/faults/test_rows_process.py freezes one too
 def test_a_frozen_host_is_no_watchdog_either(tmp_path):
-    """SIGSTOP: the connection stays open, nothing comes. On waking nothing stale may set the shaft in motion."""
+    """With SIGSTOP the connection stays open without data. After SIGCONT no stale setpoint may move the shaft."""
     with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
         tmp_path, *drive.options, "--stepped", *LONG
     ) as running:
@@ -215,7 +215,7 @@ def test_a_frozen_host_is_no_watchdog_either(tmp_path):
     assert "operation enabled" not in {state for state, now in zip(shaft.state, awake, strict=True) if now}
 
 
-# -- a mistake of ours, in each stage ------------------------------------------------------------------------
+# -- a programming error in each stage ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stage", [
@@ -229,7 +229,7 @@ def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
 
     def a_mistake_of_ours(self, command, sample):
         self.cycles += 1
-        # In setup the shaft first moves after a second of standstill and some of the probe's ramp.
+        # In setup the shaft first moves after a second of standstill and a part of the probe's ramp.
         if self.under_way == stage and self.cycles == (120 if stage == "setup" else 20):
             raise ZeroDivisionError("made for this test")
 
@@ -254,7 +254,7 @@ def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
 
 @pytest.mark.heavy
 def test_a_log_that_can_not_grow_stops_the_shaft(tmp_path):
-    """Disk full in mid-run: the stop runs all the same, and the JSON on stdout stays one document."""
+    """The disk is full during the run. The stop still runs, and the JSON on stdout is one document."""
     import resource
 
     def little_room():
@@ -274,8 +274,8 @@ def test_a_log_that_can_not_grow_stops_the_shaft(tmp_path):
 
 
 @pytest.mark.heavy
-def test_what_follows_the_shaft_is_in_order(tmp_path):
-    """Of one interrupted run: enabled, quick stop, disabled, and only then let go of the bus."""
+def test_the_end_of_an_interrupted_run_is_in_order(tmp_path):
+    """The order in an interrupted run is: enabled, quick stop, disabled, and only then the bus is closed."""
     trace = tmp_path / "shaft.csv"
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--trace", trace, *TOO_MUCH)
     assert done.code == 7
@@ -293,7 +293,7 @@ def test_what_follows_the_shaft_is_in_order(tmp_path):
 
 @pytest.mark.heavy
 def test_a_dead_simulator_ends_the_host(tmp_path):
-    """The other way round: the drive's side of the bus disappears."""
+    """The drive's side of the bus disappears in this case."""
     with peer(tmp_path, *STEPPED) as drive, host(tmp_path, *drive.options, "--stepped", *LONG) as running:
         assert reached(drive, running, "speed"), running.err
         os.kill(drive.child.pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""`tdhil support`, `tdhil rig new`, `tdhil docs`: what goes to others, what a bench begins with, where to read on."""
+"""`tdhil support`, `tdhil rig new`, `tdhil docs`: support archive, new rig file, folder of the documentation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.path.path_runs import tdhil
 from tests.rigs import rig_file
 
 USER, HOST = "janedoe", "drilling-laptop-7"
-HOMES = "/ho" "me"      # written so that no path of a home stands in the tree
+HOMES = "/ho" "me"      # split, so that no home path is in the tree
 HOME, MAC = f"{HOMES}/{USER}", "/Us" "ers"
 TELLING = ("janedoe", "drilling-laptop-7", "hunter2", "sesame", "Jane Doe", f"{MAC}/other", "C:\\Users\\third")
 
@@ -64,7 +64,7 @@ def texts(archive: Path, folder: Path) -> dict[str, str]:
     return found
 
 
-def test_the_archive_holds_all_that_is_needed_and_nobody_s_name(log, tmp_path):
+def test_the_archive_contains_all_required_data_and_no_user_name(log, tmp_path):
     rig = rig_file(tmp_path, f"# bench of Jane, {USER}@{HOST}\nnode: 3\n# password: hunter2\n")
     done = tdhil("support", log, "--rig", rig)
     assert done.code == 0, done.err
@@ -84,7 +84,7 @@ def test_the_archive_holds_all_that_is_needed_and_nobody_s_name(log, tmp_path):
     assert [(stage.name, stage.outcome) for stage in kept.stages] == [("setup", "aborted")]
 
 
-def test_it_goes_over_no_file_and_needs_a_log(log, tmp_path):
+def test_it_overwrites_no_file_and_needs_a_log(log, tmp_path):
     other = tmp_path / "mine.zip"
     other.write_text("mine")
     done = tdhil("support", log, "-o", other)
@@ -92,7 +92,7 @@ def test_it_goes_over_no_file_and_needs_a_log(log, tmp_path):
     assert tdhil("support", tmp_path / "none.mcap").code == 2
 
 
-def test_a_log_that_can_not_be_read_stays_out(tmp_path, monkeypatch):
+def test_an_unreadable_log_is_left_out(tmp_path, monkeypatch):
     broken = tmp_path / "run.mcap"
     broken.write_bytes(b"\x89MCAP0\r\n" + b"janedoe" * 40)
     done = tdhil("support", broken)
@@ -100,9 +100,9 @@ def test_a_log_that_can_not_be_read_stays_out(tmp_path, monkeypatch):
     assert "run.mcap" not in texts(tmp_path / "run.support.zip", tmp_path / "out")
 
 
-def test_numbers_of_the_log_are_untouched(log):
+def test_numbers_of_the_log_are_unchanged(log):
     scrub = Scrub(home=HOME, names=[USER])
-    assert scrub.message(1, b"\x01janedoe") == b"\x01janedoe"      # samples, commands and frames hold no text
+    assert scrub.message(1, b"\x01janedoe") == b"\x01janedoe"      # samples, commands and frames contain no text
     assert scrub.text(f"/opt/janedoes {HOMES}/x/y") == f"/opt/janedoes {HOMES}/<user>/y"
 
 
@@ -110,7 +110,7 @@ def test_numbers_of_the_log_are_untouched(log):
 
 
 @pytest.mark.parametrize("profile", profile_names())
-def test_a_new_rig_loads_and_moves_nothing_real_until_it_is_filled_in(tmp_path, profile):
+def test_a_new_rig_loads_and_permits_no_real_motion_until_it_is_completed(tmp_path, profile):
     path = tmp_path / "rig.yaml"
     done = tdhil("rig", "new", path, "--profile", profile, "--load", "none")
     assert done.code == 0, done.err
@@ -127,7 +127,7 @@ def test_a_new_rig_loads_and_moves_nothing_real_until_it_is_filled_in(tmp_path, 
     assert require_limits(load_rig(path)).speed_max_rad_s == 5
 
 
-def test_a_string_is_refused_until_its_torques_are_there(tmp_path):
+def test_a_string_is_refused_until_its_torques_are_stated(tmp_path):
     path = tmp_path / "rig.yaml"
     assert tdhil("rig", "new", path, "--load", "string").code == 0
     done = tdhil("identify", "--dry-run", "--rig", path)
@@ -139,7 +139,7 @@ def test_a_string_is_refused_until_its_torques_are_there(tmp_path):
 
 
 @pytest.mark.parametrize(("typed", "name"), [("bench 3\n", "bench 3"), ("\n", None)])
-def test_the_name_is_asked_for_at_a_terminal(tmp_path, monkeypatch, typed, name):
+def test_the_name_is_requested_at_a_terminal(tmp_path, monkeypatch, typed, name):
     class Keyboard(io.StringIO):
         def isatty(self):
             return True
@@ -151,12 +151,12 @@ def test_the_name_is_asked_for_at_a_terminal(tmp_path, monkeypatch, typed, name)
     assert ("name: the rig's own name" in done.err) is (name is None)
 
 
-def test_what_hangs_on_the_shaft_is_never_guessed(tmp_path):
+def test_the_load_is_never_assumed(tmp_path):
     assert tdhil("rig", "new", tmp_path / "rig.yaml").code == 2
     assert not (tmp_path / "rig.yaml").exists()
 
 
-def test_a_rig_is_never_written_over(tmp_path):
+def test_a_rig_is_never_overwritten(tmp_path):
     path = tmp_path / "rig.yaml"
     path.write_text("mine")
     assert (tdhil("rig", "new", path, "--load", "none").code, path.read_text()) == (2, "mine")

@@ -1,4 +1,4 @@
-"""`--tolerance`, `--max-time` and `--dry-run` as their users meet them."""
+"""`--tolerance`, `--max-time` and `--dry-run` on the command line."""
 
 import pytest
 
@@ -16,7 +16,7 @@ def half_width(document):
 
 
 @pytest.mark.heavy           # tests/runner/test_adaptive_duration.py has the rule, stage by stage
-def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
+def test_it_acquires_until_the_interval_meets_the_tolerance(tmp_path):
     trace = tmp_path / "shaft.csv"
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 2, "--tolerance", "1%", "--trace", trace)
     assert done.code == 0, done.err
@@ -31,13 +31,13 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
     stopping = read_run(done.log).configuration["stopping"]
     assert stopping["tolerance"] == 0.01
     assert stopping["decisions"][-1]["periods"] == 0
-    assert stopping["decisions"][-1]["working_confidence"] > 0.95      # what looking costs
+    assert stopping["decisions"][-1]["working_confidence"] > 0.95      # cost of interim looks
     Shaft.read(trace).assert_at_rest()
 
     tail, inertias = LogTail(done.log), []
     while not inertias or not tail.closed:
         inertias += tail.read().inertias
-    last = inertias[-1]                # on the run page: the result's own
+    last = inertias[-1]                # on the page of the run: that of the result
     for name in ("low", "high", "low_total", "high_total"):
         assert getattr(last, f"{name}_kg_m2") == pytest.approx(inertia[name], rel=1e-9)
     assert (last.inertia_kg_m2, last.confidence) == (pytest.approx(inertia["value"], rel=1e-9), 0.95)
@@ -48,13 +48,13 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.heavy
-def test_out_of_reach_is_said_before_motion_with_what_would_help(tmp_path):
+def test_an_unreachable_tolerance_is_reported_before_motion_with_advice(tmp_path):
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")
     assert done.code == 0, done.err
     assert done.document["verdict"] == "valid_wide"
     said = done.err.replace("\n", " ")
     assert said.index("can't be reached") < said.index("least possible value is ±") < said.index("stage setup")
-    assert said.rindex("can't be reached") > said.index("stage setup")      # again, with what was measured
+    assert said.rindex("can't be reached") > said.index("stage setup")      # again, with the measured values
     assert done.document["advice"] == read_run(done.log).configuration["stopping"]["advice"]
     acquire = done.document["stages"][-1]
     assert acquire["duration_s"] <= 160.0
@@ -73,7 +73,7 @@ def test_periods_fix_the_length_and_the_tolerance_is_only_compared(tmp_path):
 
 
 @pytest.mark.heavy
-def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypatch):
+def test_a_dry_run_changes_nothing_and_states_its_assumptions(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rig = rig_file(tmp_path, "expected: {inertia_kg_m2: 90.0, load_noise_nm: 4.0}\n")
     done = tdhil("identify", "--dry-run", "--rig", rig, "--json")
@@ -105,22 +105,22 @@ def test_a_dry_run_refuses_what_a_run_would_refuse(tmp_path, monkeypatch):
     assert "amplitude of 9" in tdhil("identify", "--dry-run", "--amplitude", 9).err
     assert tdhil("identify", "--dry-run", "--max-time", 20).code == 4
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
-    done = tdhil("identify", "--dry-run")                    # something real, and no limits
+    done = tdhil("identify", "--dry-run")                    # a real drive without limits
     assert done.code == 4
     assert "limits" in done.err
 
 
-def test_one_tone_is_known_beforehand_to_tell_nothing():
+def test_one_tone_is_predicted_to_give_no_j():
     done = tdhil("identify", "--dry-run", "--excitation", "sine")
     assert done.code == 0
     assert "no interval of J is expected" in done.out.replace("\n", " ")
-    assert done.out.startswith("SIMULATED: the simulated rig")      # nobody said where a drive is
+    assert done.out.startswith("SIMULATED: the simulated rig")      # no address of a drive
 
 
 # -- quantities ----------------------------------------------------------------------------------------------
 
 
-def test_quantities_as_people_type_them():
+def test_quantities_in_usual_notations():
     assert share("1%") == share(" 0.01 ") == 0.01
     assert share("0.35 %") == 0.0035
     assert [amount(TIME)(text) for text in ("300", "300s", "5min", "0.5h")] == [300.0, 300.0, 300.0, 1800.0]
@@ -130,7 +130,7 @@ def test_quantities_as_people_type_them():
     "arguments", [("--tolerance", "x%"), ("--tolerance", "100%"), ("--tolerance", "0"), ("--max-time", "5 parsecs"),
                   ("--max-time", "-1"), ("--max-time", "nan")]
 )
-def test_what_is_no_quantity_is_a_wrong_command_line(arguments):
+def test_an_invalid_quantity_is_a_usage_error(arguments):
     done = tdhil("identify", "--simulate", *arguments)
     assert done.code == 2
     assert arguments[0] in done.err

@@ -1,6 +1,6 @@
-"""A replay on another kind of processor: the same to 1e-9. On the same machine: to the last bit.
+"""Replay on another kind of processor: equal to 1e-9. On the same computer: bit for bit.
 
-OpenBLAS picks its kernels by the processor, and takes others where it is told to: two kinds of machine in one.
+OpenBLAS selects its kernels by the processor or by a setting. The tests use the setting as another kind of processor.
 """
 
 import json
@@ -14,11 +14,11 @@ import pytest
 from tests.path.path_runs import QUICK, clean_environment, identify
 
 OTHER = {"x86_64": "Prescott", "AMD64": "Prescott", "aarch64": "ARMV8", "arm64": "ARMV8"}
-"""The oldest kernels that OpenBLAS brings for a kind of processor."""
+"""Oldest kernels of OpenBLAS for a kind of processor."""
 
 
 def same(one, other, where=""):
-    """What is not a float must be equal; floats to 1e-9 of themselves."""
+    """Return whether all values are equal, and floats agree to a relative 1e-9."""
     assert type(one) is type(other), where
     if isinstance(one, dict):
         assert one.keys() == other.keys(), where
@@ -44,7 +44,7 @@ def replayed(log, **environment):
 def test_a_replay_under_other_kernels(tmp_path):
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     if "openblas" not in blas["name"] or "DYNAMIC_ARCH" not in blas.get("openblas configuration", ""):
-        pytest.skip(f"the linear algebra here is {blas['name']}, whose kernels nobody can choose")
+        pytest.skip(f"the linear algebra here is {blas['name']}, whose kernels cannot be chosen")
     if platform.machine() not in OTHER:
         pytest.skip(f"no other kernels are known for {platform.machine()}")
     live = identify(tmp_path, "--simulate", *QUICK, "--seed", 3, "--periods", 3)

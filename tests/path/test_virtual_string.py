@@ -1,4 +1,4 @@
-"""`tdhil evaluate` on the simulated drive, through CANopen frames in stepped time, from files to verdict and replay."""
+"""`tdhil evaluate` on the simulated drive, by CANopen frames in stepped time, from files to verdict and replay."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def interval(value, low, high):
 
 
 def tuning(**more):
-    """As `tdhil tune --a 0.25 --json` has it for this rig on the example's string, as far as it is looked at."""
+    """Return the used part of `tdhil tune --a 0.25 --json` for this rig with the string of the example."""
     soft = {
         "kind": "soft", "refused": None,
         "at_main_shaft": {"gain_nm_s_rad": 1186.0032, "integral_nm_rad": 999.9749, "compensated_kg_m2": 0.0,
@@ -70,7 +70,7 @@ def evaluate(folder, *more, use="soft", rate=50):
 
 
 @pytest.mark.heavy
-def test_a_soft_controller_does_on_the_drive_what_tune_says_and_its_log_says_the_same(files):
+def test_a_soft_controller_on_the_drive_agrees_with_tune_and_its_log_agrees(files):
     done = evaluate(files)
     document = done.document
     assert (done.code, document["verdict"]) == (0, "as_predicted"), done.err
@@ -89,8 +89,8 @@ def test_a_soft_controller_does_on_the_drive_what_tune_says_and_its_log_says_the
 
 
 @pytest.mark.heavy
-def test_the_drives_own_loop_does_what_tune_says_of_its_gains(files):
-    """The string through 60B2h; the gains are the plant's."""
+def test_the_drives_own_loop_agrees_with_tune(files):
+    """The string acts by 60B2h. The gains are those of the plant."""
     text = PLANT.replace("_nm_s_rad: 6000.0", "_nm_s_rad: 1186").replace("_nm_rad: 4000.0", "_nm_rad: 1000")
     assert "gain_nm_s_rad: 1186\n" in text and "gain_nm_rad: 1000\n" in text
     plant_file(files, text)
@@ -106,7 +106,7 @@ def test_the_drives_own_loop_does_what_tune_says_of_its_gains(files):
 @pytest.mark.heavy
 @pytest.mark.parametrize("own_loop", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_after_a_torque_calibration_the_string_acts_in_the_torque_of_the_drive(files, own_loop):
-    """The N·m of the drive are 10 % too small. Without the factor, the string and its controller were 9 % too weak."""
+    """The N·m of the drive are 10 % too small. Without the factor, string and controller would be 9 % too weak."""
     text = PLANT + "reporting:\n  torque_scale: 1.1\n"
     if own_loop:
         text = text.replace("_nm_s_rad: 6000.0", "_nm_s_rad: 1304.6").replace("_nm_rad: 4000.0", "_nm_rad: 1100")
@@ -122,7 +122,7 @@ def test_after_a_torque_calibration_the_string_acts_in_the_torque_of_the_drive(f
 
 @pytest.mark.long
 def test_a_reported_torque_of_nine_tenths_of_the_commanded_one_is_not_as_predicted(files):
-    """The loop itself does not use the reported torque, so all else goes as tune says."""
+    """The loop itself does not use the reported torque, so everything else agrees with tune."""
     done = evaluate(files, "--fault", "torque-scale=0.9")
     assert (done.code, done.document["verdict"]) == (9, "invalid"), done.err
     assert "reported torque is 0.9" in done.document["reason"]
@@ -141,18 +141,18 @@ def test_a_fault_while_the_bit_sticks_and_slips_ends_with_a_shaft_at_rest(files,
     assert done.code in (code, 8), done.err
     shaft = Shaft.read(files / "shaft.csv")
     assert shaft.at_rest_from() <= shaft.time_s[-1] - 1.0
-    if fault != "drive-fault":       # whose own reaction it is
+    if fault != "drive-fault":       # the reaction of the drive itself
         shaft.assert_never_let_go()
     assert shaft.speed_rad_s.min() > -SWINGS_IN_RAD_S
     begun = [row for row, event in enumerate(shaft.event) if "quick stop active" in event or "fault" in event]
-    if begun:      # nothing but braking comes after
+    if begun:      # only braking afterwards
         later = shaft.torque_nm[begun[-1] + 250:]
         assert np.all(later < 500.0)
 
 
 @pytest.mark.heavy
 def test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_drive_s_watchdog(files):
-    """The drive goes on with the last torque for the watchdog's time, then brakes by itself; nothing turns back."""
+    """The drive keeps the last torque for the watchdog time. Then its reaction brakes without reverse rotation."""
     with peer(files, "--stepped", "--seed", 1, "--plant", files / "plant.yaml") as drive, host(
         files, *drive.options, "--stepped", "--rate", 50, "--rig", files / "rig.yaml", "--controller",
         files / "tune.json", "--virtual-string", EXAMPLES / "string.yaml", command="evaluate",
@@ -177,7 +177,7 @@ def test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_dr
 
 
 def test_the_shipped_example_has_room_for_the_string(files):
-    """Laid dry: the files of the page, as they are."""
+    """A dry run uses the unchanged files of the page."""
     done = evaluate(files, "--dry-run")
     assert done.code == 0, done.err
     assert done.document["set_speed_rad_s"]["min"] * 30.0 / np.pi == pytest.approx(44.0, abs=0.1)
@@ -191,7 +191,7 @@ def test_the_shipped_example_has_room_for_the_string(files):
     (("speed_min_rad_s", 4.0), "Set it to"),
     (("load", "string"), "load is string"),
 ])
-def test_a_dry_run_names_what_keeps_the_string_from_being_turned(files, change, said):
+def test_a_dry_run_names_the_reasons_of_a_refusal(files, change, said):
     key, value = change
     if key == "inertia_kg_m2":
         document = json.loads((files / "tune.json").read_text())
@@ -216,7 +216,7 @@ def test_a_dry_run_names_what_keeps_the_string_from_being_turned(files, change, 
     (("--virtual-string", "longer"), 50, 2, "different string"),
     (("--own-loop", "--drive", "modbus"), 50, 4, "torque offset"),
 ])
-def test_what_can_not_be_evaluated_is_refused(files, more, rate, code, said):
+def test_impossible_evaluations_are_refused(files, more, rate, code, said):
     if "longer" in more:
         longer = files / "longer.yaml"
         longer.write_text((EXAMPLES / "string.yaml").read_text().replace("3000", "3100"))

@@ -1,11 +1,11 @@
-"""A virtual bus that keeps what is sent on it."""
+"""Virtual bus that records sent frames."""
 
 import can
 from can.interfaces.virtual import VirtualBus
 
 
 class WatchedBus(VirtualBus):
-    """``sent``: (identifier, data) of every frame."""
+    """Virtual bus. ``sent``: (identifier, data) of every frame."""
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel=channel)
@@ -21,5 +21,5 @@ class WatchedBus(VirtualBus):
 
     @property
     def only_reads(self) -> bool:
-        """SDO uploads alone: initiate (40h) and segments (60h, 70h), CiA 301."""
+        """Return whether all frames are SDO uploads: initiate (40h) and segments (60h, 70h), CiA 301."""
         return {data[0] for _, data in self.sent} <= {0x40, 0x60, 0x70}

@@ -1,4 +1,4 @@
-"""A host by hand: raw frames and struct only, sharing no code with the room `drivers`."""
+"""Host by hand: raw frames and struct only, without code of the room `drivers`."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ class SdoAbort(Exception):
 
 
 class Host:
-    """Talks to node 1; what comes besides the awaited answer is kept in ``heard``."""
+    """Host of node 1; frames other than the awaited reply are kept in ``heard``."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self.bus = bus
@@ -56,7 +56,7 @@ class Host:
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=signed)
 
     def refused(self, index: int, sub: int, value: int, size: int) -> int:
-        """The abort code; 0 where it was accepted."""
+        """Return the abort code, or 0 if it is accepted."""
         try:
             self.write(index, sub, value, size)
         except SdoAbort as abort:
@@ -67,12 +67,12 @@ class Host:
         self.send(0x000, bytes([command, node]))
 
     def emcy(self) -> list[int]:
-        """Error codes of the EMCYs so far, after everything under way has come."""
+        """Return the error codes of the EMCYs so far, after all frames on the way have arrived."""
         self.read(0x1000)
         return [struct.unpack_from("<H", data)[0] for can_id, data in self.heard if can_id == 0x081]
 
     def remap(self, transmission: int = 1) -> None:
-        """RPDO1: 6040 6071 60FF, TPDO1: 6041 6077 606C."""
+        """Map RPDO1: 6040 6071 60FF, TPDO1: 6041 6077 606C."""
         for communication, mapping, cob, entries in (
             (0x1400, 0x1600, 0x201, (0x60400010, 0x60710010, 0x60FF0020)),
             (0x1800, 0x1A00, 0x40000181, (0x60410010, 0x60770010, 0x606C0020)),
@@ -93,7 +93,7 @@ class Host:
 
     def cycle(self, controlword: int = 0x0F, torque: int = 0, velocity: int = 0,
               times: int = 1) -> tuple[int, int, int]:
-        """RPDO, SYNC, TPDO: (statusword, torque ‰, velocity 0.1 rpm) of the last cycle."""
+        """Run RPDO, SYNC and TPDO; return (statusword, torque ‰, velocity 0.1 rpm) of the last cycle."""
         answer = b""
         for _ in range(times):
             self.send(0x201, struct.pack("<Hhi", controlword, torque, velocity))
@@ -113,7 +113,7 @@ Bench = tuple[EmbeddedSimulator, Host]
 
 @pytest.fixture
 def bench() -> Iterator[Callable[..., Bench]]:
-    """Opens an embedded simulator (quiet and truthful unless told otherwise) and a host on its channel."""
+    """Open an embedded simulator (by default without noise and lags) and a host on its channel."""
     with ExitStack() as stack:
 
         def open_bench(params: RigParams = QUIET_RIG, **options: object) -> Bench:

@@ -1,4 +1,4 @@
-"""A Modbus host by hand: PDUs by struct only, sharing no code with the room `drivers`."""
+"""Modbus host by hand: PDUs by struct only, without code of the room `drivers`."""
 
 import struct
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ GENERIC = load_modbus_profile("generic/modbus")
 
 
 class Refusal(Exception):
-    """An exception reply."""
+    """Exception reply."""
 
     def __init__(self, code: int) -> None:
         super().__init__(str(code))
@@ -22,7 +22,7 @@ class Refusal(Exception):
 
 
 class Host:
-    """Asks unit 1, one request after the other, each when the reply before it is complete."""
+    """Host of unit 1 that sends each request after the complete reply to the one before."""
 
     def __init__(self, drive: EmbeddedModbusDrive) -> None:
         self.drive = drive
@@ -43,7 +43,7 @@ class Host:
         return struct.unpack(f">{count}H", data[1:])
 
     def number(self, address: int, kind: str = "h") -> int:
-        """One number, high word first."""
+        """Return one number, high word first."""
         words = self.read(address, struct.calcsize(">" + kind) // 2)
         return int(struct.unpack(">" + kind, struct.pack(f">{len(words)}H", *words))[0])
 
@@ -61,7 +61,7 @@ class Host:
         return struct.unpack(f">{count}H", data[1:])
 
     def refused(self, pdu: bytes) -> int:
-        """The exception's code; 0 where it was done."""
+        """Return the code of the exception, or 0 if the request is executed."""
         try:
             self.ask(pdu)
         except Refusal as refusal:
@@ -74,10 +74,10 @@ class Host:
 
 
 class GenericHost(Host):
-    """One that knows the map of generic/modbus."""
+    """Host with the map of generic/modbus."""
 
     def command(self, word: int, rpm: float = 0.0, torque: float = 0.0) -> tuple[int, float, float]:
-        """(status, speed in rpm, torque as a share of rated)."""
+        """Send a command; return (status, speed in rpm, torque as a share of rated)."""
         data = struct.pack(">Hih", word, round(100 * rpm), round(1000 * torque))
         words = self.both(16, 4, 0, struct.unpack(">4H", data))
         status, speed, actual = struct.unpack(">Hih", struct.pack(">4H", *words))
@@ -90,7 +90,7 @@ class GenericHost(Host):
 
     def cycles(self, duration_s: float, word: int = 0x0F, rpm: float = 0.0, torque: float = 0.0,
                ) -> tuple[int, float, float]:
-        """The same command every 20 ms; what came back last."""
+        """Send the same command every 20 ms; return the last reply."""
         until_s = self.now_s + duration_s
         answer = self.command(word, rpm, torque)
         while self.now_s < until_s:
@@ -101,5 +101,5 @@ class GenericHost(Host):
 
 def drive(profile: ModbusProfile = GENERIC, params: RigParams = QUIET_RIG, wrongs: Sequence[str] = (),
           **options: object) -> EmbeddedModbusDrive:
-    """Quiet and truthful unless told otherwise."""
+    """Return a drive, by default without noise and lags."""
     return EmbeddedModbusDrive(params, profile, wrongs=tuple(map(parse, wrongs)), **options)  # type: ignore[arg-type]

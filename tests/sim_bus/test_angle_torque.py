@@ -1,4 +1,4 @@
-"""The torque of the plant that depends on the angle."""
+"""Torque of the plant that depends on the angle."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""All shafts at once must be each shaft alone: the scalar plant is the oracle."""
+"""Batch of shafts: it must equal each shaft alone, with the scalar plant as the oracle."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ RIGS = [
 
 
 def swinging(rows: int, columns: int) -> np.ndarray:
-    """Starts, reversals and sticks: torques around break-away, of either sign."""
+    """Return torques around breakaway with both signs, for starts, reversals and standstills."""
     time = np.arange(rows)[:, np.newaxis]
     return 150.0 * np.sin(2.0 * np.pi * time / 900.0 + np.arange(columns)) + 20.0
 
@@ -99,7 +99,7 @@ def test_a_stuck_shaft_stays_exactly_still():
     assert state[ANGLE, 0] == 0.0
 
 
-def test_what_cannot_be_stepped_is_refused():
+def test_invalid_steps_are_refused():
     stiff = Shafts.of(10.0, 0.0, 50.0, 1e6, True)
     with pytest.raises(ValueError, match="bristle"):
         FixedStep(stiff, 0.01)
@@ -109,8 +109,8 @@ def test_what_cannot_be_stepped_is_refused():
         FixedStep(Shafts.of(1.0, 0.0, 1.0, 1.0, False), 0.0)
 
 
-def test_white_torque_has_its_density_whatever_the_step():
-    """Variance P/h, and nothing between neighbours: the spectral density is P up to the Nyquist frequency."""
+def test_white_torque_has_its_density_for_any_step():
+    """The variance is P/h without correlation, so the spectral density is P up to the Nyquist frequency."""
     power, step_s = np.array([1e-3, 1e-3, 4e-3]), np.array([0.001, 0.0005, 0.001])
     noise = white_torque(power, step_s, 200_000, np.random.default_rng(5))
     assert np.allclose(noise.var(axis=0), power / step_s, rtol=0.02)

@@ -1,4 +1,4 @@
-"""The distributed string against the wave equation's own impedance, written here from the equation itself."""
+"""Distributed string, compared with the impedance of the wave equation, derived independently here."""
 
 import cmath
 import math
@@ -17,11 +17,11 @@ DT = 0.002
 ENDS = ("mass", "free", "clamped")
 SMOOTH = StringParams(inertia_kg_m2=20.0, coulomb_nm=0.0, viscous_nm_s_rad=100.0, drag_nm_s_rad_m=0.05,
                       bottom=Bottom(coulomb_nm=0.0, viscous_nm_s_rad=40.0))
-"""A light motor, so that it is the string that is seen: its impedance is about 300 N·m·s/rad."""
+"""String with a light motor, so that its impedance of about 300 N·m·s/rad dominates."""
 
 
 def impedance(params: StringParams, hz: float) -> complex:
-    """Torque over speed at the motor, from ω'' = γ² ω with γ² = s (ρI s + d)/(G I)."""
+    """Return torque over speed at the motor, from ω'' = γ² ω with γ² = s (ρI s + d)/(G I)."""
     s = 2j * math.pi * hz
     area_moment = math.pi / 32.0 * (params.outer_diameter_m**4 - params.inner_diameter_m**4)
     inertia, compliance = params.density_kg_m3 * area_moment, 1.0 / (params.shear_modulus_pa * area_moment)
@@ -36,7 +36,7 @@ def impedance(params: StringParams, hz: float) -> complex:
 
 
 def moved(string: DrillString, torques: list[float], dt_s: float = DT) -> tuple[list[StringState], np.ndarray]:
-    """States after each step, and the mean speed in each."""
+    """Return the state after each step, and the mean speed in each."""
     state, states = string.rest(), []
     for torque in torques:
         state = string.step(state, torque, dt_s)
@@ -49,7 +49,7 @@ def moved(string: DrillString, torques: list[float], dt_s: float = DT) -> tuple[
 @pytest.mark.parametrize("hz", [
     0.2, 1.1, 5.0, *(pytest.param(hz, marks=pytest.mark.long) for hz in (0.05, 0.45, 0.7, 2.0)),
 ])
-def test_a_sine_meets_the_analytic_impedance(end: str, hz: float) -> None:
+def test_a_sine_agrees_with_the_analytic_impedance(end: str, hz: float) -> None:
     params = SMOOTH.model_copy(update={"bottom_end": end})
     count = round(1.0 / hz / DT)
     hz = 1.0 / (count * DT)
@@ -63,8 +63,8 @@ def test_a_sine_meets_the_analytic_impedance(end: str, hz: float) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("end", ENDS)
-def test_the_response_to_an_impulse_meets_it_too(end: str) -> None:
-    """One step of torque, every frequency at once: the transform of what follows is 1/impedance."""
+def test_the_response_to_an_impulse_agrees_too(end: str) -> None:
+    """One step of torque contains every frequency: the transform of the response is 1/impedance."""
     params = SMOOTH.model_copy(update={"bottom_end": end})
     _, speeds = moved(DrillString(params), [1000.0] + [0.0] * 30_000)
     assert abs(speeds[-1]) < 1e-6 * max(speeds)
@@ -104,7 +104,7 @@ def test_the_echo_comes_after_exactly_twice_the_delay(length_m: float, dt_s: flo
 
 
 def energy(string: DrillString, state: StringState) -> float:
-    """Of both ends and of the waves; exact where a tick has just ended."""
+    """Return the energy of both ends and of the waves, exact at the end of a tick."""
     bottom = string.params.bottom.inertia_kg_m2 if string.params.bottom_end == "mass" else 0.0
     waves = float(np.sum(state.down_nm**2 + state.up_nm**2)) * string.tick_s / (4.0 * string.impedance_nm_s_rad)
     return (0.5 * string.params.inertia_kg_m2 * state.speed_rad_s**2
@@ -115,7 +115,7 @@ def energy(string: DrillString, state: StringState) -> float:
 @settings(max_examples=25, deadline=None)
 @given(end=st.sampled_from(ENDS), friction=st.sampled_from(["coulomb", "stribeck"]), drag=st.sampled_from([0.0, 0.02]),
        torque=st.floats(-3000, 3000), viscous=st.floats(0, 50))
-def test_energy_never_grows_by_itself(end: str, friction: str, drag: float, torque: float, viscous: float) -> None:
+def test_energy_never_grows_without_work(end: str, friction: str, drag: float, torque: float, viscous: float) -> None:
     params = StringParams(bottom_end=end, friction=friction, drag_nm_s_rad_m=drag,       # type: ignore[arg-type]
                           viscous_nm_s_rad=viscous, bottom=Bottom(friction=friction))    # type: ignore[arg-type]
     string = DrillString(params)
@@ -152,7 +152,7 @@ def test_a_clamped_string_holds_the_torque_by_its_twist() -> None:
     states, _ = moved(string, [400.0] * 90_000)
     stiffness = params.shear_modulus_pa * params.polar_moment_m4 / params.length_m
     assert states[-1].angle_rad * stiffness == pytest.approx(400.0, rel=1e-6)
-    assert string.top_torque_nm(states[-1]) == pytest.approx(400.0, rel=2e-4)       # the last waves still run
+    assert string.top_torque_nm(states[-1]) == pytest.approx(400.0, rel=2e-4)       # the last waves still travel
     assert states[-1].bottom_angle_rad == 0.0
 
 
@@ -202,6 +202,6 @@ def test_the_bit_sticks_and_slips_at_low_speed_only(speed: float, sticks: bool) 
     ({"length_m": 1.0}, r"length_m: waves would take 0\.000315 s"),
     ({"length_m": 1e6}, r"length_m: waves would take 315 s"),
 ])
-def test_what_is_no_string_is_refused(bad: dict[str, float], says: str) -> None:
+def test_invalid_strings_are_refused(bad: dict[str, float], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         StringParams(**bad)  # type: ignore[arg-type]

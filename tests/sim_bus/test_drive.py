@@ -1,4 +1,4 @@
-"""The drive in motion over the bus: modes, limits, stops, faults, the watchdog."""
+"""Drive in motion over the bus: modes, limits, stops, faults, watchdog."""
 
 import math
 import time
@@ -21,7 +21,7 @@ def state(status: int) -> str:
 
 
 def until_at_rest(host: Any, word: int, most: int = 1500, **setpoints: int) -> int:
-    """Cycles until the drive says standstill (bit 10 or a state without torque)."""
+    """Run cycles until the drive reports standstill (bit 10 or a state without torque)."""
     for count in range(most):
         status, _, speed = host.cycle(word, **setpoints)
         if abs(speed) < 3 and (status & 0x0400 or state(status) in ("off", "fault")):
@@ -125,7 +125,7 @@ def test_quick_stop_options(bench: Open, option: int, end: str, mode: int) -> No
 
 
 @pytest.mark.heavy
-def test_halt_stays_enabled_and_goes_on(bench: Open) -> None:
+def test_halt_stays_enabled_and_can_be_released(bench: Open) -> None:
     simulated, host = bench()
     host.set_up()
     host.enable(velocity=200)
@@ -159,7 +159,7 @@ def watched(host: Any, option: int, behaviour: int = 1) -> None:
     host.write(0x1029, 1, behaviour, 1)
     host.write(0x1016, 1, 127 << 16 | 100, 4)
     host.enable(velocity=200)
-    host.cycle(velocity=200, times=1000)                                  # no heartbeat yet: nothing is watched
+    host.cycle(velocity=200, times=1000)                                  # no heartbeat yet: no supervision
     assert host.emcy() == []
     for _ in range(10):
         host.send(0x77F, b"\x05")
@@ -177,7 +177,7 @@ def test_watchdog_reactions(bench: Open, option: int, first: str, last: str) -> 
     status = host.cycle(velocity=200, times=13)[0]
     assert host.emcy() == [0x8130] and status & 0x80                      # warning
     assert state(status) == first
-    status = host.cycle(velocity=200, times=1500)[0]                      # setpoints keep coming: they don't restart it
+    status = host.cycle(velocity=200, times=1500)[0]                      # further setpoints do not restart it
     assert state(status) == last
     assert abs(simulated.simulator.speed_rad_s) < 0.06 or option == 0
     assert host.read(0x1001) == 0x11 and host.read(0x603F) == 0x8130 and host.read(0x1003, 1) == 0x8130
@@ -207,7 +207,7 @@ def test_error_behaviour(bench: Open, behaviour: int, nmt: int) -> None:
     watched(host, 3, behaviour)
     for _ in range(20):
         host.send(0x080)
-    host.nmt(128 if nmt == 4 else 99)                                       # lets SDO work again, as a barrier
+    host.nmt(128 if nmt == 4 else 99)                                       # enables SDO again, as a barrier
     host.read(0x1000)
     assert [1 for can_id, data in host.heard if can_id == 0x081]
     assert simulated.simulator.node.nmt.state == (127 if nmt == 4 else nmt)
@@ -254,10 +254,10 @@ def test_trace_and_silence(bench: Open, tmp_path: Path) -> None:
     path = tmp_path / "shaft.csv"
     simulated, host = bench(trace=path)
     watched(host, 3)
-    simulated.simulator._time.silence_s = 0.05          # from here on: before, a busy computer's host may take his time
+    simulated.simulator._time.silence_s = 0.05          # from here on; before, the host on a busy computer may be slow
     deadline = time.monotonic() + 120.0
     while "state: switch on disabled" not in path.read_text() and time.monotonic() < deadline:
-        time.sleep(0.02)                                                    # the host says nothing
+        time.sleep(0.02)                                                    # the host sends nothing
     lines = path.read_text().splitlines()
     assert lines[0] == "time_s,speed_rad_s,torque_nm,state,event"
     rows = [line.split(",") for line in lines[1:]]

@@ -1,4 +1,4 @@
-"""Scripted faults: how they are written, when they begin and end, and what the drive then does on its bus."""
+"""Scripted faults: syntax, begin and end, and behaviour of the drive on its bus."""
 
 from itertools import pairwise
 
@@ -17,7 +17,7 @@ TIMES = st.integers(0, 99_999).map(lambda ms: f"{ms}ms")
 
 
 @given(st.sampled_from(sorted(KINDS)), st.sampled_from(["", *STAGE_NUMBERS]), TIMES, st.none() | TIMES)
-def test_what_is_written_is_read(name, stage, after, duration):
+def test_a_written_script_is_read(name, stage, after, duration):
     text = f"{name}@{stage + '+' if stage else ''}{after}" + (f"/{duration}" if duration else "")
     fault = parse(text)
     assert (fault.name, fault.at.stage, fault.text) == (name, STAGE_NUMBERS.get(stage, 0), text)
@@ -112,7 +112,7 @@ def test_the_list_is_wrapped_at_the_width_of_the_terminal():
     assert " ".join(found.split()) == " ".join(KINDS.listing(1000).split())
 
 
-def test_a_fault_that_there_is_not_is_one_line(capsys):
+def test_an_unknown_fault_gives_one_line(capsys):
     assert main(["canopen", "--hub", "127.0.0.1:0", "--fault", "stoo@hold"]) == 2
     err = capsys.readouterr().err
     assert "no fault is called 'stoo'" in err
@@ -123,7 +123,7 @@ def test_a_fault_that_there_is_not_is_one_line(capsys):
 
 
 class Host:
-    """Raw frames against a stepped drive; what came back, SYNC by SYNC."""
+    """Host that sends raw frames to a stepped drive and collects the replies per SYNC."""
 
     def __init__(self, *faults):
         self.simulated = EmbeddedSimulator(faults=parse_all(faults)).open()
@@ -145,7 +145,7 @@ class Host:
         return self.ask(bytes((0x2F, 0xFE, 0x5F, 0x04, number, 0, 0, 0)))
 
     def syncs(self, count):
-        """Frames (identifier, data) of so many SYNCs; an answered SDO comes behind all that went before."""
+        """Return the frames (identifier, data) of a number of SYNCs. An SDO reply marks the end of earlier frames."""
         for _ in range(count):
             self.send(0x080, b"")
         self.send(0x601, b"\x40\x00\x10\x00\0\0\0\0")
@@ -172,7 +172,7 @@ def host():
         one.close()
 
 
-def test_a_stage_is_taken_and_starts_the_clock_of_its_faults(host):
+def test_a_stage_is_accepted_and_starts_the_clock_of_its_faults(host):
     drive = host("emcy@hold+200ms=4310h")
     drive.syncs(100)
     assert drive.stage(4)[0] == 0x60
@@ -181,14 +181,14 @@ def test_a_stage_is_taken_and_starts_the_clock_of_its_faults(host):
     assert (before, [data[:2] for _, data in after]) == ([], [b"\x10\x43"])
 
 
-def test_without_a_script_nothing_is_said_of_cycles(host):
+def test_without_a_script_the_ends_of_cycles_are_not_marked(host):
     drive = host()
     drive.stage(5)
     assert CYCLE_ID not in {identifier for identifier, _ in drive.syncs(50)}
 
 
 def test_until_the_last_fault_is_over_each_cycle_has_its_end(host):
-    """From the first on: what a fault makes the drive say as it begins is then in its cycle, on any computer."""
+    """Messages at the begin of a fault are in its cycle on any computer, from the first cycle on."""
     drive = host("heartbeat-lost@100ms/200ms")
     ends = [data for identifier, data in drive.syncs(60) if identifier == CYCLE_ID]
     assert ends[0] == CYCLES_END
@@ -198,8 +198,8 @@ def test_until_the_last_fault_is_over_each_cycle_has_its_end(host):
 
 
 @pytest.mark.heavy
-def test_a_question_is_answered_behind_all_that_came_before_it(host):
-    """Also where nothing else gets through, and without a script; of real time nothing is said."""
+def test_a_sync_request_is_answered_after_all_earlier_frames(host):
+    """This holds with all other frames lost, and without a script. Real time is not included."""
     for fault in ((), ("bus-dead@100ms",), ("frame-loss@100ms=100%",)):
         drive = host(*fault)
         drive.syncs(20)
@@ -224,8 +224,8 @@ def test_heartbeats_end_and_come_again(host):
     assert all(count == 1 for count in [*counts[1:3], *counts[8:]])
 
 
-def test_a_lost_sync_lets_time_go_on(host):
-    """All frames are lost, the SYNCs too; from the 51st on they are heard again."""
+def test_time_advances_with_a_lost_sync(host):
+    """All frames before the 51st SYNC are lost, including the SYNCs."""
     drive = host("frame-loss@100ms=100%/400ms")
     drive.syncs(60)
     assert drive.simulated.simulator.time_s == pytest.approx(0.6)
@@ -236,18 +236,18 @@ def test_a_lost_sync_lets_time_go_on(host):
     ("write-not-kept=6080h", b"\x23\x80\x60\x00\x01\0\0\0", "60 80 60 00 00 00 00 00"),
     ("reads-back-otherwise=6076h", b"\x40\x76\x60\x00\0\0\0\0", "43 76 60 00 44 42 0f 00"),
 ])
-def test_what_sdo_answers(fault, request_, answer, host):
+def test_replies_of_sdo(fault, request_, answer, host):
     """6076h of the default rig is 1,000,000 mN·m = 000F4240h."""
     assert host(fault).ask(request_).hex(" ") == answer
 
 
-def test_a_write_that_is_not_kept_leaves_what_stood_there(host):
+def test_a_write_that_is_not_kept_leaves_the_former_value(host):
     drive = host("watchdog-not-armed")
     assert drive.ask(b"\x23\x16\x10\x01\xf4\x01\x7f\0")[0] == 0x60
     assert drive.ask(b"\x40\x16\x10\x01\0\0\0\0")[4:] == bytes(4)
 
 
-def test_two_answer_where_a_node_id_is_there_twice(host):
+def test_two_nodes_with_one_id_both_reply(host):
     drive = host("duplicate-node")
     drive.bus.recv(0.1)
     drive.send(0x601, b"\x40\x00\x10\x00\0\0\0\0")
@@ -258,7 +258,7 @@ def test_two_answer_where_a_node_id_is_there_twice(host):
     assert answers[-1][4:] == b"\x92\x01\x02\x00"
 
 
-def test_a_dead_bus_is_silent_and_its_plant_goes_on(host):
+def test_a_dead_bus_is_silent_and_its_plant_continues(host):
     drive = host("bus-dead@100ms")
     for _ in range(100):
         drive.send(0x080, b"")

@@ -1,4 +1,4 @@
-"""Each friction model against its equations, integrated piecewise from event to event; and what must hold."""
+"""Each friction model, compared with its equations integrated from event to event; and general properties."""
 
 import math
 from itertools import pairwise
@@ -17,11 +17,11 @@ from sim_bus.plant.rigid import Params, ShaftState, friction_torque, step
 MODELS = ("coulomb", "stribeck", "dahl", "lugre")
 STICKING = ("coulomb", "stribeck")
 PROFILE = ((0.0, 1.0, 250.0), (1.0, 3.0, -200.0), (3.0, 7.0, 40.0))
-"""(from, to, torque): start from rest, reversal, stick."""
+"""(from, to, torque) for start from standstill, reversal, and standstill."""
 
 
 class Law(NamedTuple):
-    """The textbook's letters, on their own: nothing of the simulator's equations is used here."""
+    """Parameters of the textbook, without equations of the simulator."""
 
     J: float
     B: float
@@ -50,10 +50,10 @@ class Law(NamedTuple):
 
 
 def reference(params: Params, times: np.ndarray, profile: tuple = PROFILE) -> np.ndarray:
-    """Speed at ``times``. The sign of ω is fixed within a piece, whose end is the event ω = 0 or a change of torque."""
+    """Return the speed at ``times``. The sign of ω is constant within a piece that ends at ω = 0 or a torque change."""
     law = Law.of(params)
     speed, w, z = np.zeros_like(times), 0.0, 0.0
-    # Without a bristle the solver has nothing that makes it look closely where friction bends.
+    # Without a bristle, the solver would take large steps at the kink of friction.
     longest = np.inf if law.s0 else min(1e-2, law.ws / 10.0)
     for begin, end, u in profile:
         now = begin
@@ -89,7 +89,7 @@ def simulated(params: Params, dt_s: float, profile: tuple = PROFILE) -> np.ndarr
 
 
 def deviation(params: Params, dt_s: float, profile: tuple = PROFILE) -> float:
-    """Largest deviation of the speed, as a share of its range."""
+    """Return the largest deviation of the speed, as a share of its range."""
     times = np.arange(round(profile[-1][1] / dt_s) + 1) * dt_s
     truth = reference(params, times, profile)
     assert truth.max() > 0.0 > truth.min()                    # it did start and reverse
@@ -133,7 +133,7 @@ SHORT = ((0.0, 0.02, 100.0), (0.02, 0.04, -90.0), (0.04, 0.08, 40.0))
     ({"friction": "lugre", "lugre_stiffness_nm_rad": 1e5, "lugre_damping_nm_s_rad": 0.0}, 1e-4),
     ({"friction": "lugre", "lugre_stiffness_nm_rad": 1e5, "lugre_damping_nm_s_rad": 316.0}, 1e-4),
 ])
-def test_a_shaft_ten_thousand_times_lighter_is_still_followed(words: dict[str, object], bound: float) -> None:
+def test_a_shaft_ten_thousand_times_lighter_is_still_accurate(words: dict[str, object], bound: float) -> None:
     assert deviation(Params(inertia_kg_m2=0.01, **words), 0.002, SHORT) < bound  # type: ignore[arg-type]
 
 
@@ -144,7 +144,7 @@ def test_a_shaft_ten_thousand_times_lighter_is_still_followed(words: dict[str, o
     {"friction": "lugre", "lugre_stiffness_nm_rad": stiffness, "lugre_damping_nm_s_rad": damping}
     for stiffness in (1e5, 1e7) for damping in (0.0, 300.0, 1e4)
 ] + [{"friction": "dahl", "dahl_stiffness_nm_rad": stiffness} for stiffness in (1e5, 1e7)], ids=str)
-def test_a_stiff_bristle_comes_to_rest_and_stays(words: dict[str, object], inertia: float) -> None:
+def test_a_stiff_bristle_comes_to_standstill_and_stays(words: dict[str, object], inertia: float) -> None:
     params = Params(inertia_kg_m2=inertia, viscous_nm_s_rad=80.0, **words)  # type: ignore[arg-type]
     state, top = ShaftState(0.2), 0.2 + 300.0 / 80.0
     for _ in range(50):
@@ -170,7 +170,7 @@ def energy(params: Params, state: ShaftState) -> float:
 @settings(max_examples=100, deadline=None)
 @given(friction=st.sampled_from(MODELS), speed=st.floats(-5, 5), drive=st.floats(-400, 400),
        viscous=st.floats(0, 20), inertia=st.sampled_from([20.0, 104.0, 1500.0]))
-def test_friction_only_takes_energy(friction: str, speed: float, drive: float, viscous: float, inertia: float) -> None:
+def test_friction_dissipates_energy(friction: str, speed: float, drive: float, viscous: float, inertia: float) -> None:
     params = Params(friction=friction, viscous_nm_s_rad=viscous, inertia_kg_m2=inertia)  # type: ignore[arg-type]
     state = ShaftState(speed)
     stored, work, scale = energy(params, state), 0.0, 0.0
@@ -185,7 +185,7 @@ def test_friction_only_takes_energy(friction: str, speed: float, drive: float, v
 @settings(max_examples=100, deadline=None)
 @given(friction=st.sampled_from(MODELS), speed=st.floats(-1, 1), dt_s=st.sampled_from([0.0005, 0.002, 0.01]),
        inertia=st.sampled_from([0.01, 1.0, 104.0]))
-def test_left_alone_it_never_gets_faster(friction: str, speed: float, dt_s: float, inertia: float) -> None:
+def test_without_torque_it_never_accelerates(friction: str, speed: float, dt_s: float, inertia: float) -> None:
     params = Params(friction=friction, inertia_kg_m2=inertia)  # type: ignore[arg-type]
     state = ShaftState(speed)
     most = energy(params, state)
@@ -234,7 +234,7 @@ def test_both_directions_are_alike(friction: str, speed: float, bristle: float, 
 @settings(max_examples=60, deadline=None)
 @given(friction=st.sampled_from(MODELS), speed=st.floats(0.01, 5))
 def test_steady_sliding_has_the_torque_of_the_law(friction: str, speed: float) -> None:
-    """Torque in balance at a speed: nothing changes; the law is written out once more here."""
+    """With balanced torque the speed is constant. The law is stated again here."""
     params = Params(friction=friction, inertia_kg_m2=1e6)  # type: ignore[arg-type]
     law = Law.of(params)
     bristle = law.g(speed) / law.s0 if law.s0 else 0.0

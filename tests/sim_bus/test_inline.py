@@ -1,7 +1,7 @@
-"""The drive in the host's own thread says what it says over python-can's virtual bus, and it is there at once.
+"""Drive in the host's thread: it sends the same frames as over python-can's virtual bus, at once.
 
-The other end of the comparison is `EmbeddedSimulator`, with its thread; a numbered question (6FEh) says when that has
-said all it had to say to a frame.
+The reference is `EmbeddedSimulator` with its thread. A numbered request (6FEh) marks the end of its replies
+to a frame.
 """
 
 import random
@@ -32,7 +32,7 @@ def frame(can_id: int, data: bytes = b"", **more: bool) -> can.Message:
 
 
 def session(seed: int) -> list[can.Message]:
-    """A host that turns the shaft, and then says whatever comes into its head, nonsense among it."""
+    """Return the frames of a host that turns the shaft and then sends random frames, also invalid ones."""
     rng = random.Random(seed)
     frames = [frame(can_id, bytes.fromhex(data)) for can_id, data in TURNING]
     for _ in range(400):
@@ -55,7 +55,7 @@ def session(seed: int) -> list[can.Message]:
 
 
 def over_the_virtual_bus(frames: list[can.Message], **options: object) -> list[Said]:
-    """What came back to each frame."""
+    """Return the replies to each frame."""
     answers = []
     simulated = EmbeddedSimulator(seed=5, **options)  # type: ignore[arg-type]
     with can.Bus(interface="virtual", channel=simulated.channel) as bus, simulated:
@@ -94,10 +94,10 @@ def inline(frames: list[can.Message], **options: object) -> list[Said]:
     (("replayed-feedback@1s=1/1s", "emcy@1500ms=7305h"), None), (("bus-dead@1s",), None),
     (("reordered-frames=30%", "foreign-heartbeat=100ms"), None),
 ])
-def test_it_says_what_it_says_over_the_virtual_bus(
+def test_it_sends_the_same_frames_as_over_the_virtual_bus(
     faults: tuple[str, ...], worn: str | None, tmp_path: Path
 ) -> None:
-    """Frame by frame, and in its trace, too."""
+    """The frames and the traces are equal."""
     profile = load_canopen_profile(worn) if worn else None
     frames = session(len(faults))
     paths = tmp_path / "virtual.csv", tmp_path / "inline.csv"
@@ -120,7 +120,7 @@ def test_no_thread_is_needed() -> None:
         assert simulated.bus.recv(0.001) is None
 
 
-def test_every_station_hears_what_the_others_and_the_drive_say() -> None:
+def test_every_station_receives_frames_of_the_others_and_of_the_drive() -> None:
     with InlineSimulator() as simulated:
         other = simulated.station()
         simulated.bus.send(frame(0x601, b"\x40\x00\x10\x00\0\0\0\0"))
@@ -133,8 +133,8 @@ def test_every_station_hears_what_the_others_and_the_drive_say() -> None:
                 act()
 
 
-def test_a_message_stays_its_senders() -> None:
-    """What it is changed to afterwards comes neither to the drive, which holds it until the SYNC, nor to a station."""
+def test_a_later_change_of_a_sent_message_has_no_effect() -> None:
+    """A later change of it reaches neither the drive, which keeps it until the SYNC, nor a station."""
     with InlineSimulator() as simulated:
         host, other = simulated.bus, simulated.station()
         for can_id, data in TURNING:
@@ -166,8 +166,8 @@ def fails(error: BaseException):  # type: ignore[no-untyped-def]
     return fail
 
 
-def test_what_fails_comes_out_at_the_end_and_leaves_silence(tmp_path: Path) -> None:
-    """As with the thread: a host is not told by `send`, which it would take for a fault of its adapter."""
+def test_a_failure_is_raised_at_the_end_and_leaves_silence(tmp_path: Path) -> None:
+    """`send` does not raise, as with the thread, since the host would assume a fault of its adapter."""
     simulated = InlineSimulator(trace=tmp_path / "shaft.csv")
     with pytest.raises(RuntimeError) as failure, simulated:
         simulated.simulator.node.on_frame = fails(ZeroDivisionError())  # type: ignore[method-assign]
@@ -179,7 +179,7 @@ def test_what_fails_comes_out_at_the_end_and_leaves_silence(tmp_path: Path) -> N
     assert "power on" in (tmp_path / "shaft.csv").read_text()
 
 
-def test_the_hosts_own_error_comes_first() -> None:
+def test_an_error_of_the_host_takes_precedence() -> None:
     with pytest.raises(KeyError), InlineSimulator() as simulated:
         simulated.simulator.node.on_frame = fails(ZeroDivisionError())  # type: ignore[method-assign]
         simulated.bus.send(frame(0x080))
@@ -193,8 +193,8 @@ def test_a_drive_that_does_not_start() -> None:
         pass
 
 
-def test_an_interrupt_in_the_middle_of_a_step_goes_on_its_way() -> None:
-    """And nothing is taken from then on, nor is the half step played to its end."""
+def test_an_interrupt_within_a_step_is_raised() -> None:
+    """After it, no frames are accepted, and the incomplete step is not finished."""
     simulated = InlineSimulator(faults=parse_all(["sto@hold"])).open()
     for can_id, data in TURNING:
         simulated.bus.send(frame(can_id, bytes.fromhex(data)))
@@ -208,7 +208,7 @@ def test_an_interrupt_in_the_middle_of_a_step_goes_on_its_way() -> None:
     simulated.close()
 
 
-def test_a_pause_changes_nothing_and_out_of_stepped_time_the_wall_clock_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pause_has_no_effect_in_stepped_time_and_counts_in_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
     class Clock:
         now_s = 100.0
 
@@ -230,7 +230,7 @@ def test_a_pause_changes_nothing_and_out_of_stepped_time_the_wall_clock_counts(m
         drained(host)
         host.send(frame(0x701))
         assert simulated.simulator.time_s == pytest.approx(0.12, abs=0.003)
-        assert [can_id for can_id, _ in drained(host)] == [0x701]      # the heartbeat of the meantime
+        assert [can_id for can_id, _ in drained(host)] == [0x701]      # the heartbeat during this time
         clock.now_s += 3.0                                             # longer than the host's heartbeat may be missing
         host.send(frame(0x701))
         assert 0x081 in [can_id for can_id, _ in drained(host)]

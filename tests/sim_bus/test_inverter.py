@@ -137,7 +137,7 @@ def test_lag_does_not_depend_on_the_step() -> None:
     assert results[0] == pytest.approx(results[2], rel=2e-3)
 
 
-def test_quanta() -> None:
+def test_resolution() -> None:
     drive = Inverter(RigParams(), np.random.default_rng(3))
     drive.control.speed(3.0)
     run(drive, 2.0)
@@ -147,7 +147,7 @@ def test_quanta() -> None:
 
 
 @pytest.mark.heavy
-def test_noise_has_the_size_it_says_and_repeats_with_its_seed() -> None:
+def test_noise_has_the_stated_size_and_repeats_with_its_seed() -> None:
     def load(seed: int) -> list[float]:
         params = RigParams(plant=Params(coulomb_nm=1e6), noise=NoiseParams(speed_sensor_rad_s=0.0, torque_nm=0.0))
         drive = Inverter(params, np.random.default_rng(seed))
@@ -169,13 +169,13 @@ def test_steps_are_equal_and_never_longer_than_the_control_period() -> None:
     assert [drive.steps(period)[0] for period in (0.001, 0.002, 0.004, 0.005, 0.01, 0.0201)] == [1, 1, 2, 3, 5, 11]
 
 
-def test_nothing_acts_when_off() -> None:
+def test_no_torque_when_disabled() -> None:
     drive = Inverter(RigParams(), np.random.default_rng(0))
     run(drive, 1.0)
     assert drive.speed_rad_s == 0.0 and drive.torque_nm == 0.0
 
 
-def test_a_torque_offset_is_added_to_the_speed_loop_inside_its_limit_and_the_loop_takes_it_up() -> None:
+def test_a_torque_offset_is_added_within_the_limit_and_the_speed_loop_compensates_it() -> None:
     drive = inverter()
     drive.control.speed(3.0)
     run(drive, 20.0)
@@ -191,7 +191,7 @@ def test_a_torque_offset_is_added_to_the_speed_loop_inside_its_limit_and_the_loo
     assert drive.control.demand_nm == 400.0 and drive.control.limited
 
 
-def test_a_stop_with_an_offset_that_stays_comes_to_rest_all_the_same() -> None:
+def test_a_stop_with_a_remaining_offset_reaches_standstill() -> None:
     drive = inverter()
     drive.control.speed(3.0)
     run(drive, 20.0)
@@ -201,7 +201,7 @@ def test_a_stop_with_an_offset_that_stays_comes_to_rest_all_the_same() -> None:
     assert drive.speed_rad_s == pytest.approx(0.0, abs=1e-3)
 
 
-def test_the_reference_filter_is_of_first_order_and_begins_at_the_speed_that_is() -> None:
+def test_the_reference_filter_is_of_first_order_and_begins_at_the_present_speed() -> None:
     slow = RigParams().drive.model_copy(
         update={"reference_filter_s": 0.5, "speed_gain_nm_s_rad": 30000.0, "speed_filter_s": 0.0, "torque_lag_s": 0.0,
                 "torque_limit_nm": 4000.0}

@@ -1,7 +1,7 @@
-"""Debian's mbpoll (libmodbus) as the independent host: it reads and writes what the profiles' documents name.
+"""Debian's mbpoll (libmodbus) as the independent host: it reads and writes registers from the drive manuals.
 
-Over TCP and over RTU on a pseudo terminal. Installs nothing; without mbpoll it says loudly that it was skipped, and
-with TDHIL_REQUIRE_MBPOLL=1 that fails. mbpoll counts from 1, as most manuals do; ``-0`` makes it count from 0.
+The tests use TCP, and RTU on a pseudo terminal. They install nothing; without mbpoll they are skipped visibly, and
+with TDHIL_REQUIRE_MBPOLL=1 they fail. mbpoll counts from 1, as most manuals do; ``-0`` makes it count from 0.
 """
 
 import os
@@ -37,7 +37,7 @@ def mbpoll_or_loud() -> None:
 
 
 class Poll:
-    """mbpoll towards one drive."""
+    """mbpoll with one drive."""
 
     def __init__(self, *where: str) -> None:
         self._where = where
@@ -49,7 +49,7 @@ class Poll:
         return done.stdout + done.stderr
 
     def read(self, register: int, count: int = 1, *options: str) -> list[int]:
-        """Sixteen-bit registers, or what ``options`` say (-t 4:int, -B)."""
+        """Read 16-bit registers, or other types by ``options`` (-t 4:int, -B)."""
         kind = () if "-t" in options else ("-t", "4:hex")
         text = self("-r", str(register), "-c", str(count), *kind, *options)
         values = re.findall(r"^\[\d+\]:\s+(?:0x([0-9A-F]+)|(-?\d+))", text, re.MULTILINE)
@@ -62,7 +62,7 @@ class Poll:
 
 @contextmanager
 def served(name: str, line: str, unit: int = 1) -> Iterator[tuple[Poll, Machine]]:
-    """The simulated drive in a thread, in real time."""
+    """Run the simulated drive in a thread, in real time."""
     listener: RequestListener
     where: tuple[str, ...]
     if line == "tcp":
@@ -107,21 +107,21 @@ def test_generic_map(line: str) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("line", LINES)
-def test_the_shaft_obeys(line: str) -> None:
+def test_the_shaft_follows(line: str) -> None:
     with served("generic/modbus", line) as (poll, machine):
-        poll.write(41, 3000)               # every write is a program to be started, which may take its time
+        poll.write(41, 3000)               # every write starts a program, which may be slow
         for word, status in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
             assert "Written 1 references" in poll.write(1, word)
             assert poll.read(17)[0] & 0x6F == status
         poll.write(1, 2000, options=("-0", "-t", "4:int", "-B"))
         wait_for("motion", lambda: poll.read(17, 1, "-0", "-t", "4:int", "-B")[0] > 0)       # speed, 0.01 rpm
-        # silence: the watchdog stops it
+        # silence: the watchdog stops the shaft
         wait_for("rest", lambda: machine.watchdog.lost and abs(machine.inverter.speed_rad_s) < 0.005)
         assert poll.read(17)[0] & 0x6F == 0x07
 
 
-# Typed from the documents' register numbers: as they are written there, what mbpoll is to be told, what is read of a
-# drive that has just been switched on, and how one of its settings is written.
+# Register numbers from the manuals: as printed, for mbpoll, the value of a
+# drive after power-on, and a write of one of its settings.
 DOCUMENTED = [
     ("siemens/g120", "40110 status word ZSW1", (110, 1), (), [0xEA40]),
     ("siemens/g120", "40324 reference speed p2000, rpm", (324, 1), (), [1500]),
@@ -152,7 +152,7 @@ SETTINGS = [
 def test_documented_registers(name: str) -> None:
     line = load_modbus_profile(name).line.transports[0]
     with served(name, line) as (poll, machine):
-        while machine.time_s < 0.2:                                              # standing still is seen after 0.1 s
+        while machine.time_s < 0.2:                                              # standstill is detected after 0.1 s
             threading.Event().wait(0.02)
         for _, _, (register, count), options, words in (row for row in DOCUMENTED if row[0] == name):
             assert poll.read(register, count, *options) == words
@@ -162,7 +162,7 @@ def test_documented_registers(name: str) -> None:
             assert poll.read(register, 1, *options) == [value]
 
 
-def test_a_drive_without_function_6_says_so() -> None:
+def test_a_drive_without_function_6_replies_with_an_exception() -> None:
     """MEMOBUS has 03, 08 and 10h only; mbpoll writes one register with 06 and two with 10h."""
     with served("yaskawa/ga700", "rtu") as (poll, _):
         assert "Illegal function" in poll.write(2, 0, options=("-0", "-t", "4"))

@@ -1,4 +1,4 @@
-"""Walks through the states of each family, with words and bits typed from the documents, not from a profile."""
+"""State sequences of each family, with words and bits from the manuals, not from a profile."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ STEP_S = 0.002
 
 
 class Bench:
-    """A family over a drive, without registers."""
+    """One family with a drive, without registers."""
 
     def __init__(self, family: str, **wiring: object) -> None:
         self.application = Application(Inverter(QUIET_RIG, np.random.default_rng(0)))
@@ -20,7 +20,7 @@ class Bench:
         self.words = FAMILIES[family](self.application, Wiring(**wiring))  # type: ignore[arg-type]
 
     def send(self, word: int, for_s: float = 0.02) -> int:
-        """Status word after the word has stood for so long."""
+        """Return the status word after the control word has been set for a time."""
         self.words.write(word)
         return self.run(for_s)
 
@@ -77,9 +77,9 @@ def test_off2_coasts_and_inhibits(family: str) -> None:
 def test_off3_is_the_quick_stop_and_inhibits(family: str) -> None:
     bench = started(family)
     assert bench.send(0x047B) & 0x0024 == 0x0000                               # OFF3 acts, operation not enabled
-    assert bench.send(0x047F) & 0x0024 == 0x0000                               # not taken back under way
+    assert bench.send(0x047F) & 0x0024 == 0x0000                               # not cancelled during the stop
     bench.run(0.7)
-    assert bench.speed < 0.8                                                   # 3 rad/s², and the loop's lag
+    assert bench.speed < 0.8                                                   # 3 rad/s² plus the lag of the loop
     assert bench.run(2.0) & 0x0067 == 0x0060 and abs(bench.speed) < 0.01
     assert bench.send(0x047F) & 0x0067 == 0x0060
 
@@ -103,17 +103,17 @@ def test_fault_and_reset_on_the_edge(family: str) -> None:
     assert not bench.send(0x04FE) & 0x0008
 
 
-def test_without_the_bus_bit_profidrive_hears_nothing() -> None:
+def test_without_the_bus_bit_profidrive_ignores_the_word() -> None:
     bench = started("profidrive")
     for word in (0x0000, 0x007B, 0x007E):
         assert bench.send(word, 0.5) & 0x0007 == 0x0007 and not bench.words.listens
     assert bench.speed == pytest.approx(2.0, abs=0.05)
 
 
-def test_without_the_bus_bit_abb_hears_only_the_off_bits() -> None:
+def test_without_the_bus_bit_abb_uses_only_the_off_bits() -> None:
     bench = started("abb")
-    assert bench.send(0x0077) & 0x0007 == 0x0007 and not bench.words.listens   # bit 3 at 0 isn't heard
-    assert bench.send(0x007B) & 0x0024 == 0x0000                               # OFF3 is
+    assert bench.send(0x0077) & 0x0007 == 0x0007 and not bench.words.listens   # bit 3 at 0 is ignored
+    assert bench.send(0x007B) & 0x0024 == 0x0000                               # OFF3 is not
 
 
 def test_ext2_is_torque_where_it_is_wired() -> None:
@@ -125,7 +125,7 @@ def test_ext2_is_torque_where_it_is_wired() -> None:
 
 
 @OFF_FAMILIES
-def test_a_drive_that_stopped_by_itself_stays_stopped(family: str) -> None:
+def test_a_drive_that_stopped_without_a_command_stays_stopped(family: str) -> None:
     bench = started(family)
     bench.application.settings.connection_option = 3
     bench.application.abort_connection()
@@ -133,9 +133,9 @@ def test_a_drive_that_stopped_by_itself_stays_stopped(family: str) -> None:
     assert bench.send(0x047F, 3.0) & 0x0047 == 0x0040 and abs(bench.speed) < 0.01
 
 
-def test_profidrive_bits_of_its_own() -> None:
+def test_bits_particular_to_profidrive() -> None:
     bench = started("profidrive", reverse_bits=0x0800)
-    assert bench.words.status() & 0xF800 == 0xE800                             # no limit, forwards, nothing too hot
+    assert bench.words.status() & 0xF800 == 0xE800                             # no limit, forward, no overtemperature
     bench.application.inverter.control.limits.torque_forward_nm = 1.0
     assert not bench.run(1.0) & 0x0800
     bench.application.inverter.control.limits.torque_forward_nm = 400.0
@@ -158,7 +158,7 @@ def test_cia402_words() -> None:
 
 
 @pytest.mark.parametrize(("brakes", "status"), [(True, 0x07), (False, 0x40)])
-def test_a_quick_stop_in_torque_mode_is_as_the_drive_is(brakes: bool, status: int) -> None:
+def test_a_quick_stop_in_torque_mode_depends_on_the_drive(brakes: bool, status: int) -> None:
     bench = Bench("cia402", holds_after_quick_stop=True, brakes_in_torque=brakes, torque_bits=0x0800)
     for word in (0x06, 0x07, 0x0F):
         bench.send(word)
@@ -233,7 +233,7 @@ def test_danfoss_documented_words() -> None:
     bench = Bench("danfoss_fc")
     bench.send(0x047C, 8.0)
     assert bench.words.status() == 0x0F07                                      # running at the reference
-    assert bench.send(0x007C) == 0x0F07 and not bench.words.listens            # bit 10: the word doesn't count
+    assert bench.send(0x007C) == 0x0F07 and not bench.words.listens            # bit 10: the word is ignored
     assert bench.send(0x003C) == 0x0F07
     assert bench.send(0x847C, 0.0) and bench.words.reversed
 
@@ -246,7 +246,7 @@ def test_yaskawa_directions(wiring: dict[str, int], word: int) -> None:
     assert Bench("yaskawa", status_address=0x4B).words.status() & 0x00A0 == 0x0020
 
 
-def test_delta_direction_fault_and_reset_stand_elsewhere() -> None:
+def test_delta_has_direction_fault_and_reset_elsewhere() -> None:
     bench = Bench("delta", status_address=0x2226)
     extras = bench.words.extras()
     assert bench.send(0x0022, 8.0) & 0x001F == 0x0016 and bench.speed == pytest.approx(-2.0, abs=0.05)

@@ -1,4 +1,4 @@
-"""The embedded drive over its registers: moves, switches, stops, is watched, repeats."""
+"""Embedded drive over its registers: motion, modes, stops, watchdog, repeatability."""
 
 import struct
 from itertools import pairwise
@@ -33,7 +33,7 @@ def test_speed_control_and_quick_stop() -> None:
     assert abs(simulated.speed_rad_s) < 0.005
 
 
-def test_torque_control_takes_over_without_a_bump() -> None:
+def test_the_switch_to_torque_control_is_bumpless() -> None:
     simulated = drive()
     host = GenericHost(simulated)
     host.enable(20.0)
@@ -80,7 +80,7 @@ def test_silence_stops_the_shaft(tmp_path: Path) -> None:
     path = tmp_path / "shaft.csv"
     with drive(trace=path) as simulated:
         host = GenericHost(simulated)
-        host.wait(2.0)                                                           # not armed, nobody heard: nothing
+        host.wait(2.0)                                                           # not armed and no master: no reaction
         watched(host)
         began_s = host.now_s
         simulated.run_until(began_s + 0.29)
@@ -89,7 +89,7 @@ def test_silence_stops_the_shaft(tmp_path: Path) -> None:
         assert abs(simulated.speed_rad_s) < 0.005
         host.now_s = began_s + 4.0
         assert host.read(16)[0] & 0x00EF == 0x0087                               # quick stop active, warning
-        assert host.command(0x0F, 20.0)[0] & 0x6F == 0x07                        # the old word doesn't undo it
+        assert host.command(0x0F, 20.0)[0] & 0x6F == 0x07                        # the old word does not reverse it
         host.command(0x00)
         host.enable(20.0)
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
@@ -122,7 +122,7 @@ def test_reactions(reaction: str, state: int, braking: bool, at_rest: bool) -> N
     word = host.read(16)[0]
     assert word & (0x6F if state in {0x07, 0x27} else 0x4F) == state and word & 0x80
     assert (abs(simulated.speed_rad_s) < 0.01) is at_rest
-    host.cycles(1.0, rpm=20.0)                                                   # the same command goes on
+    host.cycles(1.0, rpm=20.0)                                                   # the same command continues
     assert (abs(simulated.speed_rad_s) < 0.01) is at_rest
 
 
@@ -151,7 +151,7 @@ WORDS = st.sampled_from([0x00, 0x02, 0x06, 0x07, 0x0F, 0x0F, 0x0F, 0x80, 0x10F])
 @pytest.mark.heavy
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.tuples(WORDS, st.integers(-60, 60), st.integers(-300, 300), st.integers(0, 1)), max_size=25))
-def test_whatever_was_said_silence_brings_the_shaft_to_rest(said: list[tuple[int, int, int, int]]) -> None:
+def test_after_any_commands_silence_stops_the_shaft(said: list[tuple[int, int, int, int]]) -> None:
     simulated = drive()
     host = GenericHost(simulated)
     host.write_one(40, 500)
@@ -161,7 +161,7 @@ def test_whatever_was_said_silence_brings_the_shaft_to_rest(said: list[tuple[int
         host.wait(0.2)
     host.wait(25.0)
     assert abs(simulated.speed_rad_s) < 0.01
-    assert host.read(16)[0] & 0x6F != 0x27                                       # nothing is enabled any more
+    assert host.read(16)[0] & 0x6F != 0x27                                       # the drive is no longer enabled
 
 
 def test_a_reported_value_saturates_at_its_register() -> None:
@@ -175,7 +175,7 @@ def test_a_reported_value_saturates_at_its_register() -> None:
     assert host.number(19) == -32768
 
 
-def test_a_reaction_that_is_not_chosen_does_nothing() -> None:
+def test_a_reaction_that_is_not_selected_has_no_effect() -> None:
     simulated = drive()
     host = GenericHost(simulated)
     host.write_one(41, 0)
@@ -200,8 +200,8 @@ def modbus_profiles() -> list[str]:
 
 @pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("name", modbus_profiles())
-def test_every_profile_is_worn_turns_and_stops(name: str) -> None:
-    """By the profile's own words: its states lead to enabled, the shaft follows, its quick stop brings it to rest."""
+def test_every_profile_turns_and_stops_the_simulated_drive(name: str) -> None:
+    """The words of the profile enable the drive, the shaft follows, and the quick stop brings it to standstill."""
     profile = load_modbus_profile(name)
     with EmbeddedModbusDrive(QUIET_RIG, profile, unit=7) as simulated:
         machine = simulated.machine

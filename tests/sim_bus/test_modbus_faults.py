@@ -1,4 +1,4 @@
-"""Scripted faults of the Modbus drive: what is refused, what each does to requests, replies and shaft, by hand."""
+"""Scripted faults of the Modbus drive: refusals, and effects on requests, replies and shaft, by hand."""
 
 import os
 import socket
@@ -33,13 +33,13 @@ def host(*faults: str, **options: object) -> GenericHost:
 
 
 def reply_to(one: GenericHost, pdu: bytes = READ) -> tuple[bytes | None, float]:
-    """And how long it took."""
+    """Return the reply and its duration."""
     began_s = one.now_s
     reply, one.now_s = one.drive.serve(1, pdu, began_s)
     return reply, one.now_s - began_s
 
 
-# -- what may be written ---------------------------------------------------------------------------------------
+# -- syntax -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", sorted(KINDS))
@@ -76,7 +76,7 @@ def test_no_text_does_worse_than_be_refused(text: str) -> None:
         assert str(error)
 
 
-def test_a_parameter_that_the_profile_has_not() -> None:
+def test_a_parameter_that_the_profile_does_not_have() -> None:
     with pytest.raises(FaultRefused, match=r"no parameter 'nix'.*time_out"):
         host("reads-back-otherwise=nix")
 
@@ -91,11 +91,11 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(lines) == 2 and "'stoo'" in lines[0] and "no reset on this line" in lines[1]
 
 
-# -- when ------------------------------------------------------------------------------------------------------
+# -- begin and end ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stage", STAGE_NUMBERS)
-def test_a_stage_begins_it_once(stage: str) -> None:
+def test_a_stage_starts_it_once(stage: str) -> None:
     one = host(f"no-reply@{stage}+1s/500ms")
     one.wait(5.0)
     other = "hold" if stage != "hold" else "speed"
@@ -113,7 +113,7 @@ def test_a_stage_begins_it_once(stage: str) -> None:
     assert reply_to(one)[0] == PATTERN
 
 
-def test_a_stage_is_heard_through_any_fault_and_feeds_no_watchdog() -> None:
+def test_a_stage_is_accepted_during_any_fault_and_feeds_no_watchdog() -> None:
     one = host("no-reply@1s", "drive-fault@hold")
     one.write_one(40, 300)
     one.enable(5.0)
@@ -143,7 +143,7 @@ def test_exceptions(code: int) -> None:
     one.wait(1.2)
     assert one.refused(READ) == one.refused(struct.pack(">BHH", 6, 38, 77)) == code
     one.wait(1.0)
-    assert one.read(38) == (100,)                                               # nothing was done
+    assert one.read(38) == (100,)                                               # no effect on the drive
 
 
 def test_no_reply_and_a_late_one() -> None:
@@ -157,11 +157,11 @@ def test_no_reply_and_a_late_one() -> None:
     assert acknowledged and late.drive.machine.parameters.number("torque_limit") == 77
 
 
-def test_short_and_lost_by_its_crc() -> None:
+def test_a_short_reply_and_one_with_a_wrong_crc() -> None:
     assert reply_to(host("short-reply"))[0] == PATTERN[:3]
     spoilt = host("bad-crc")
     assert reply_to(spoilt, struct.pack(">BHH", 6, 38, 77))[0] is None
-    assert spoilt.drive.machine.parameters.number("torque_limit") == 77         # it did act
+    assert spoilt.drive.machine.parameters.number("torque_limit") == 77         # the request was executed
 
 
 def test_a_share_repeats_with_its_seed() -> None:
@@ -174,14 +174,14 @@ def test_a_share_repeats_with_its_seed() -> None:
     assert 0.18 < sum(first) / 200 < 0.42                                        # 30 % ± 3.7 standard deviations
 
 
-def test_frozen_feedback_lets_writing_through() -> None:
+def test_frozen_feedback_permits_writing() -> None:
     one = host("frozen-feedback@4s")
     one.enable(20.0)
     one.cycles(4.2 - one.now_s, rpm=20.0)
     kept = one.command(0x0F, 20.0)
     one.cycles(2.0, rpm=0.0)
     assert one.command(0x0F) == kept and kept[1] > 1.0
-    assert abs(one.drive.speed_rad_s) < 0.1                                      # it did come to rest
+    assert abs(one.drive.speed_rad_s) < 0.1                                      # it came to standstill
     assert one.number(42, "I") == 0x12345678
 
 
@@ -196,14 +196,14 @@ def test_a_fault_of_the_drive_and_sto() -> None:
     speed_rad_s = off.drive.speed_rad_s
     off.cycles(0.5, rpm=20.0)
     assert off.drive.machine.inverter.torque_nm == 0.0 and off.drive.speed_rad_s > 0.8 * speed_rad_s
-    assert off.command(0x06)[0] & 0x6F == off.command(0x07)[0] & 0x6F == 0x40    # nothing switches it on
+    assert off.command(0x06)[0] & 0x6F == off.command(0x07)[0] & 0x6F == 0x40    # it cannot be enabled
     off.wait(2.0)
     off.enable()
     tripped.cycles(4.0, rpm=20.0)
     assert tripped.command(0x0F)[0] & 0x4F == 0x08 and abs(tripped.drive.speed_rad_s) < 0.01
 
 
-def test_less_torque_stays_less_whatever_is_written() -> None:
+def test_a_reduced_torque_stays_reduced_after_any_write() -> None:
     one = host("internal-limit@1s=20%/2s")
     most = one.drive.machine.inverter.control.limits.torque_forward_nm
     one.wait(1.5)
@@ -215,7 +215,7 @@ def test_less_torque_stays_less_whatever_is_written() -> None:
 
 
 @pytest.mark.heavy
-def test_what_is_reported() -> None:
+def test_false_reports() -> None:
     right, inverted, scaled = host(), host("encoder-inverted"), host("torque-scale=2")
     for one in (right, inverted, scaled):
         one.enable(20.0)
@@ -224,7 +224,7 @@ def test_what_is_reported() -> None:
     assert right.drive.speed_rad_s == inverted.drive.speed_rad_s == scaled.drive.speed_rad_s
 
 
-def test_a_lost_load_turns_up_faster() -> None:
+def test_a_lost_load_accelerates_faster() -> None:
     right, light = host(), host("load-lost@1s=20%")
     for one in (right, light):
         one.enable()
@@ -250,7 +250,7 @@ def test_the_watchdogs_time_is_not_kept_and_other_writes_are() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(WRONGS))
-def test_wiring_is_that_of_the_same_wrong(name: str) -> None:
+def test_a_fault_of_the_wiring_equals_the_same_scripted_error(name: str) -> None:
     def said(one: GenericHost) -> list[tuple[int, ...] | int]:
         one.refused(struct.pack(">BHH", 6, 38, 321))
         pdus = [struct.pack(">BHH", 3, address, 1) for address in range(16, 52)]
@@ -265,7 +265,7 @@ def test_wiring_is_that_of_the_same_wrong(name: str) -> None:
 
 @contextmanager
 def served(line: str, *faults: str) -> Iterator[str]:
-    """A drive on a line of its own; how it is reached."""
+    """Yield the address of a drive on its own line."""
     stop = threading.Event()
     with Machine(QUIET_RIG, GENERIC, stepped=False) as machine:
         listener = TcpListener("127.0.0.1", 0) if line == "tcp" else RtuListener(
@@ -301,7 +301,7 @@ def test_on_tcp_another_transaction() -> None:
         assert reply[2:] == struct.pack(">HHB", 0, 7, 1) + PATTERN and reply[:2] != b"\x12\x34"
 
 
-def test_on_tcp_a_late_reply_comes_after_all() -> None:
+def test_on_tcp_a_late_reply_still_arrives() -> None:
     with served("tcp", "late-reply=300ms") as where, ExitStack() as stack:
         client = connected(stack, where)
         began_s = time.monotonic()
@@ -314,7 +314,7 @@ def test_on_tcp_a_late_reply_comes_after_all() -> None:
         assert [got[:2], got[13:15]] == [b"\0\1", b"\0\2"]
 
 
-def test_on_tcp_connections_that_die_once() -> None:
+def test_on_tcp_connections_that_are_lost_once() -> None:
     with served("tcp", "reset") as where, ExitStack() as stack:
         client = connected(stack, where)
         ask(client, 1)
@@ -331,7 +331,7 @@ def test_on_tcp_connections_that_die_once() -> None:
         ask(again, 3)
         assert again.recv(64)[7:] == PATTERN
         client.settimeout(0.05)
-        with pytest.raises(TimeoutError):                                        # neither an answer nor an end
+        with pytest.raises(TimeoutError):                                        # neither a reply nor an end
             client.recv(64)
 
 

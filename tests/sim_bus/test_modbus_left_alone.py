@@ -1,9 +1,9 @@
-"""A simulated Modbus drive whose host has left in motion: its watchdog stops the shaft, and the trace shows it."""
+"""Simulated Modbus drive whose host ends in motion: its watchdog stops the shaft, and the trace shows it."""
 
 from tests.sim_bus.modbus_host import GenericHost, drive
 
 
-def test_it_runs_on_until_its_watchdog_has_stopped_the_shaft() -> None:
+def test_it_continues_until_its_watchdog_has_stopped_the_shaft() -> None:
     host = GenericHost(drive())
     host.write_one(40, 500)                                        # time-out, ms
     host.enable(20.0)
@@ -15,4 +15,4 @@ def test_it_runs_on_until_its_watchdog_has_stopped_the_shaft() -> None:
     assert 1.0 < host.drive.time_s - left_s < 30.0
     again_s = host.drive.time_s
     host.drive.run_on()
-    assert host.drive.time_s - again_s < 1.5                       # at rest already
+    assert host.drive.time_s - again_s < 1.5                       # already at standstill

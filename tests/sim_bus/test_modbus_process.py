@@ -1,4 +1,4 @@
-"""The simulated Modbus drive as a process of its own, the frames around its requests, and its command line."""
+"""Simulated Modbus drive as a separate process, its frames, and its command line."""
 
 import os
 import signal
@@ -47,15 +47,15 @@ def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
         assert host == "127.0.0.1"
         with socket.create_connection((host, int(port)), timeout=120) as first, \
                 socket.create_connection((host, int(port)), timeout=120) as second:
-            second.sendall(b"GET / HTTP/1.0\r\n\r\n")                       # no Modbus: hung up on
+            second.sendall(b"GET / HTTP/1.0\r\n\r\n")                       # no Modbus: the connection is closed
             assert second.recv(64) == b""
             ask = struct.pack(">HHHB", 0x1234, 0, len(READ) + 1, 9) + READ
-            first.sendall(ask[:5])                                            # in pieces
+            first.sendall(ask[:5])                                            # in parts
             first.sendall(ask[5:] + ask[:9])
             assert first.recv(64) == struct.pack(">HHHB", 0x1234, 0, 7, 9) + REPLY
             first.sendall(ask[9:])
             assert first.recv(64)[7:] == REPLY
-            first.sendall(struct.pack(">HHHB", 1, 0, len(READ) + 1, 8) + READ)   # another unit: silence
+            first.sendall(struct.pack(">HHHB", 1, 0, len(READ) + 1, 8) + READ)   # another unit: no reply
             first.settimeout(0.2)
             with pytest.raises(TimeoutError):
                 first.recv(64)
@@ -66,7 +66,7 @@ def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
         process.kill()
         process.communicate()
     rows = [line.split(",") for line in trace.read_text().splitlines()[1:]]
-    assert rows[0][4] == "power on" and len(rows) > 20                        # the plant goes on when nobody talks
+    assert rows[0][4] == "power on" and len(rows) > 20                        # the plant continues without requests
     assert all(float(a[0]) <= float(b[0]) for a, b in pairwise(rows))
 
 
@@ -94,7 +94,7 @@ def test_over_a_pseudo_terminal() -> None:
         process.communicate()
 
 
-def test_what_cannot_be_used_costs_one_line(tmp_path: Path) -> None:
+def test_unusable_addresses_give_one_line(tmp_path: Path) -> None:
     plant = plant_file(tmp_path, "plant:\n  inertja: 1\n")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -113,7 +113,7 @@ def test_what_cannot_be_used_costs_one_line(tmp_path: Path) -> None:
 
 
 def one_line(*arguments: str) -> str:
-    """What is printed in this process; the exit code is that of a mistake in usage."""
+    """Run in this process and return the printed text; the exit code is that of a usage error."""
     import contextlib
     import io
 
@@ -194,12 +194,12 @@ def test_broken_and_unknown_rtu_frames() -> None:
     receiver = RtuReceiver()
     asked = framed(b"\x01" + READ)
     assert list(receiver.feed(asked[:-1] + bytes([asked[-1] ^ 1]), 0.0)) == []
-    assert list(receiver.feed(asked, 0.001)) == [ReceivedRequest(1, READ)]    # as long as it should be: dropped whole
+    assert list(receiver.feed(asked, 0.001)) == [ReceivedRequest(1, READ)]    # of the right length: dropped as a whole
     assert list(receiver.feed(framed(b"\x01\x41\x00\x07"), 0.002)) == [ReceivedRequest(1, b"\x41\x00\x07")]
 
 
 @given(st.binary(min_size=7, max_size=64))
-def test_anything_else_on_tcp_is_hung_up_on(data: bytes) -> None:
+def test_the_connection_is_closed_on_other_data(data: bytes) -> None:
     _, protocol, length = struct.unpack_from(">HHH", data)
     if protocol or not 2 <= length <= 254:
         with pytest.raises(NotModbus):
@@ -208,6 +208,6 @@ def test_anything_else_on_tcp_is_hung_up_on(data: bytes) -> None:
         list(tcp_requests(bytearray(data)))
 
 
-def test_replies_carry_what_the_request_had() -> None:
+def test_replies_repeat_the_header_of_the_request() -> None:
     assert tcp_reply(ReceivedRequest(5, READ, 0xABCD), REPLY) == bytes.fromhex("abcd00000007 05") + REPLY
     assert rtu_reply(ReceivedRequest(5, READ), REPLY) == framed(b"\x05" + REPLY)

@@ -1,4 +1,4 @@
-"""The register bank of the simulated drive: functions, exceptions, types, scales, and what parameters do."""
+"""Register bank of the simulated drive: functions, exceptions, types, scales, and effects of parameters."""
 
 import struct
 from math import pi
@@ -20,7 +20,7 @@ SOURCE = {"source": "for this test", "confidence": "verified"}
 
 @given(st.sampled_from(sorted(FORMATS)).flatmap(lambda kind: st.tuples(
     st.just(kind), st.integers(RegisterLayout(0, kind).lowest, RegisterLayout(0, kind).highest))), st.booleans())
-def test_every_number_of_every_type_is_stored_as_struct_does(case: tuple[str, int], high_first: bool) -> None:
+def test_every_number_of_every_type_is_stored_as_by_struct(case: tuple[str, int], high_first: bool) -> None:
     kind, number = case
     layout = RegisterLayout(7, kind, high_first=high_first)
     packed = struct.pack(">" + FORMATS[kind], number)
@@ -31,7 +31,7 @@ def test_every_number_of_every_type_is_stored_as_struct_does(case: tuple[str, in
 
 
 @given(st.sampled_from(sorted(FORMATS)), st.floats(-1e13, 1e13))
-def test_what_does_not_fit_saturates(kind: str, value: float) -> None:
+def test_values_out_of_range_saturate(kind: str, value: float) -> None:
     layout = RegisterLayout(0, kind)
     number = layout.saturated(value)
     wanted = value if kind[0] == "i" else abs(value)
@@ -58,7 +58,7 @@ def test_exceptions(pdu: str, code: int) -> None:
 
 
 @given(st.binary(max_size=260))
-def test_any_request_is_answered(pdu: bytes) -> None:
+def test_any_request_gets_a_reply(pdu: bytes) -> None:
     reply, _ = SHARED.serve(1, pdu, SHARED.time_s)
     assert reply is not None
     code = pdu[0] if pdu else 0
@@ -76,7 +76,7 @@ def test_a_refused_write_changes_nothing() -> None:
         assert host.read(0, 5) == (0, 1, 2, 3, 0)
 
 
-def test_writing_half_of_a_number_leaves_the_other() -> None:
+def test_writing_half_of_a_number_keeps_the_other_half() -> None:
     host = GenericHost(drive())
     host.write(1, (0x1234, 0x5678))
     host.write_one(2, 0x9ABC)
@@ -93,7 +93,7 @@ def test_limits_of_length() -> None:
         assert host.refused(bytes.fromhex(pdu)) == code
 
 
-def test_registers_in_a_gap_may_be_read_along_and_not_written() -> None:
+def test_registers_in_a_gap_can_be_read_but_not_written() -> None:
     profile = GENERIC.model_copy(update={"cycle": GENERIC.cycle.model_copy(update={"largest_gap": 11})})
     host = GenericHost(drive(profile))
     assert host.read(5, 11) == (0,) * 11
@@ -101,7 +101,7 @@ def test_registers_in_a_gap_may_be_read_along_and_not_written() -> None:
     assert host.refused(bytes.fromhex("0300600001")) == 2                    # beyond the map
 
 
-def test_marker_says_simulated_and_stepped() -> None:
+def test_marker_shows_simulated_and_stepped() -> None:
     words = Host(drive()).read(0xFDE8, 13)
     assert struct.pack(">12H", *words[:12]).rstrip(b"\0") == b"tdhil simulated drive" and words[12] == 1
 
@@ -123,7 +123,7 @@ def test_a_name_plate_fits_small_and_large_machines(torque_nm: float) -> None:
     assert host.number(34, "H") * 10 == pytest.approx(watt, rel=0.005)
 
 
-def test_a_rig_that_the_drive_cannot_tell_is_refused() -> None:
+def test_a_rig_beyond_the_range_of_the_registers_is_refused() -> None:
     rated = GENERIC.parameters[0].model_copy(update={"register_": GENERIC.parameters[0].register_.model_copy(
         update={"type": "u16"})})
     profile = GENERIC.model_copy(update={"parameters": (rated, *GENERIC.parameters[1:])})
@@ -131,22 +131,22 @@ def test_a_rig_that_the_drive_cannot_tell_is_refused() -> None:
         drive(profile)
 
 
-def test_filters_tell_what_the_drive_has() -> None:
+def test_filter_registers_show_the_filters_of_the_drive() -> None:
     lags = ReportingParams(speed_lag_s=0.0123456, torque_lag_s=0.0)
     simulated = drive(params=RigParams(reporting=lags))
     worn = simulated.machine.inverter.params.reporting
     assert GenericHost(simulated).read(45, 2) == (12, 0)
-    assert (worn.speed_lag_s, worn.torque_lag_s) == (0.012, 0.0)               # the rounded one is the true one
+    assert (worn.speed_lag_s, worn.torque_lag_s) == (0.012, 0.0)               # the rounded value is used
     assert (worn.speed_quantum_rpm, worn.torque_quantum_permille) == (0.0, 0.0)
 
 
-def test_documented_filters_are_worn() -> None:
+def test_documented_filters_are_used() -> None:
     profile = changed({"filters": ({"signal": "torque", "documented_s": 0.0064, **SOURCE},)})
     worn = drive(profile, RigParams()).machine.inverter.params.reporting
     assert (worn.speed_lag_s, worn.torque_lag_s) == (0.40, 0.0064)
 
 
-def test_a_cut_off_frequency_is_told_as_such() -> None:
+def test_a_cut_off_frequency_is_reported_as_such() -> None:
     data = GENERIC.model_dump(by_alias=True)
     data["parameters"][-2].update(unit="hz", per_lsb=0.001)
     simulated = drive(ModbusProfile.model_validate(data), RigParams())
@@ -154,7 +154,7 @@ def test_a_cut_off_frequency_is_told_as_such() -> None:
     assert simulated.machine.inverter.params.reporting.speed_lag_s == pytest.approx(0.4, rel=0.01)
 
 
-def test_limits_act() -> None:
+def test_limits_are_effective() -> None:
     simulated = drive()
     host = GenericHost(simulated)
     host.write_one(38, 150)                                                    # ‰
@@ -168,7 +168,7 @@ def test_limits_act() -> None:
     assert simulated.machine.application.settings.quick_stop_rad_s2 == pytest.approx(28.6 * pi / 30)
 
 
-def test_what_takes_a_restart_is_kept_and_does_not_act() -> None:
+def test_a_value_that_needs_a_restart_is_stored_without_effect() -> None:
     data = GENERIC.model_dump(by_alias=True)
     limit = next(one for one in data["parameters"] if one["name"] == "torque_limit")
     limit["writable_in_operation"] = False
@@ -196,7 +196,7 @@ def test_a_quick_stop_time_counts_from_the_speed_that_it_names() -> None:
 
 
 @given(st.integers(-20_000, 20_000), st.integers(-2**31, 2**31 - 1))
-def test_echoes_show_what_was_understood(torque: int, speed: int) -> None:
+def test_echoes_show_the_decoded_value(torque: int, speed: int) -> None:
     host = GenericHost(SHARED)
     host.now_s = SHARED.time_s
     host.write(1, struct.unpack(">3H", struct.pack(">ih", speed, torque)))

@@ -1,4 +1,4 @@
-"""The line's timing, held to the rates that serial lines with drives carry."""
+"""Timing of the line, compared with the rates of serial lines with drives."""
 
 import struct
 
@@ -12,7 +12,7 @@ READ = struct.pack(">BHH", 3, 16, 4)
 
 
 def rate_hz(timing: LineTiming, registers: int, written: int = 0) -> float:
-    """Cycles a second: one read of so many registers, and where asked one write."""
+    """Return cycles per second with one read of this number of registers, and optionally one write."""
     period_s = transaction_s(timing, 5, 2 + 2 * registers)
     if written:
         period_s += transaction_s(timing, 6 + 2 * written, 5)
@@ -20,7 +20,7 @@ def rate_hz(timing: LineTiming, registers: int, written: int = 0) -> float:
 
 
 def transaction_s(timing: LineTiming, request: int, reply: int) -> float:
-    """Two PDUs, and the silence after the reply."""
+    """Return the time of two PDUs and the silence after the reply."""
     return timing.acts_after_s(request, 0.0) + timing.way_s(reply, 0.0) + timing.silence_s
 
 
@@ -46,7 +46,7 @@ def test_the_embedded_drive_carries_that_rate(baud: int) -> None:
 
 
 def test_a_transaction_by_hand() -> None:
-    """19,200 baud: 8 characters, 3.5 of silence, 10 ms, 13 characters, each 11 bits."""
+    """The transaction at 19,200 baud has 8 characters, 3.5 of silence, 10 ms, and 13 characters, each of 11 bits."""
     simulated = drive(timing=LineTiming.rtu(19200, TURN_AROUND_S))
     reply, complete_s = simulated.serve(1, READ, 1.0)
     assert reply is not None and len(reply) == 10
@@ -56,7 +56,7 @@ def test_a_transaction_by_hand() -> None:
     assert next_s == pytest.approx(complete_s + 28 * 11 / 19200 + 0.010)
 
 
-def test_another_unit_is_not_answered_and_broadcast_acts() -> None:
+def test_another_unit_gets_no_reply_and_a_broadcast_is_executed() -> None:
     simulated = drive()
     assert simulated.serve(2, READ, 0.0)[0] is None
     assert simulated.serve(0, struct.pack(">BHH", 6, 38, 77), 0.1)[0] is None

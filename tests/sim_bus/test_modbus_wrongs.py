@@ -1,4 +1,4 @@
-"""What each scripted wrong does to the registers of generic/modbus; by hand, against the same drive without it."""
+"""Effect of each scripted error on the registers of generic/modbus, compared with the same drive without it."""
 
 import struct
 from math import pi
@@ -28,9 +28,9 @@ def test_scale_10() -> None:
         assert wrong.number(address, kind) == pytest.approx(10 * right.number(address, kind), abs=5)
     assert wrong.number(42, "I") == 0x12345678 and wrong.number(44) == -12345     # no scale
     wrong.write(1, struct.unpack(">3H", struct.pack(">ih", 2000, 100)))
-    assert wrong.drive.machine.application.target_speed_rad_s == pytest.approx(2.0 * pi / 30)     # 20 rpm was meant
-    assert wrong.number(48, "i") == 2000                                          # 0.001 rpm, a count of its own
-    assert wrong.number(50, "i") == pytest.approx(1000, abs=1)                    # 0.01 N·m; 100 were meant
+    assert wrong.drive.machine.application.target_speed_rad_s == pytest.approx(2.0 * pi / 30)     # 20 rpm was intended
+    assert wrong.number(48, "i") == 2000                                          # 0.001 rpm, a different count
+    assert wrong.number(50, "i") == pytest.approx(1000, abs=1)                    # 0.01 N·m; 100 were intended
     for one in (right, wrong):
         one.enable(20.0)
         one.cycles(8.0, rpm=20.0)
@@ -41,7 +41,7 @@ def test_address_off_by_one() -> None:
     right, wrong = host(), host("address_off_by_one")
     assert wrong.read(33, 15) == right.read(32, 15)
     assert wrong.refused(struct.pack(">BHH", 3, 16, 5)) == 2
-    assert wrong.read(0xFDE8, 13) == right.read(0xFDE8, 13)                      # the marker isn't the drive's
+    assert wrong.read(0xFDE8, 13) == right.read(0xFDE8, 13)                      # the marker is not of the drive
 
 
 def test_sign() -> None:
@@ -52,7 +52,7 @@ def test_sign() -> None:
     assert (right.number(48, "i"), wrong.number(48, "i")) == (-20_000, 20_000)
     assert (right.number(50, "i"), wrong.number(50, "i")) == (10_000, -10_000)
     assert right.number(32, "I") == wrong.number(32, "I")                        # has no sign
-    assert wrong.drive.machine.application.target_speed_rad_s < 0                # only what is reported
+    assert wrong.drive.machine.application.target_speed_rad_s < 0                # only the reported value
 
 
 def test_unsigned() -> None:
@@ -60,7 +60,7 @@ def test_unsigned() -> None:
     assert wrong.number(44) == 12345
     wrong.write_one(3, 0x10000 - 100)
     assert wrong.drive.machine.application.target_torque_nm == pytest.approx(65436)
-    assert wrong.number(50, "i") == pytest.approx(6_543_600)                      # shows what was made of it
+    assert wrong.number(50, "i") == pytest.approx(6_543_600)                      # shows the decoded value
 
 
 def test_write_not_applied() -> None:

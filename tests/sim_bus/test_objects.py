@@ -114,7 +114,7 @@ def test_sdo_is_silent_in_stopped_and_pdo_outside_operational(bench: Open) -> No
     host.send(0x601, struct.pack("<BHB4x", 0x40, 0x1000, 0))
     host.nmt(1)
     host.cycle(0x06)
-    assert host.heard == []                                           # no answer while stopped
+    assert host.heard == []                                           # no reply while stopped
     assert host.read(0x6041) & 0x6F == 0x21
 
 
@@ -127,7 +127,7 @@ def test_nmt_resets(bench: Open, command: int, kept: bool) -> None:
     assert host.wait(0x701) == b"\0"
     assert host.read(0x6085) == (777 if kept else 300)
     assert host.read(0x1A00, 0) == 1 and host.read(0x1006) == 0
-    assert host.read(MARKER_INDEX, 2) == 1                            # the clock is not the drive's
+    assert host.read(MARKER_INDEX, 2) == 1                            # the clock is not reset
     host.nmt(129, node=5)
     assert host.read(0x1000) == 0x00020192
 
@@ -188,7 +188,7 @@ def test_malformed_frames_do_no_harm(bench: Open) -> None:
         answers.append(host.wait(0x581))
 
 
-def test_a_rated_torque_that_6076h_cannot_hold_is_refused_in_words():
+def test_a_rated_torque_out_of_the_range_of_6076h_is_refused_with_a_reason():
     """An EPOS4 counts µN·m in 32 bits."""
     assert rated_torque_counts(4294.0, 1e-6) == 4_294_000_000
     with pytest.raises(TdhilError, match=r"6076h cannot hold the rated torque of 7580 N·m: .* ends at 4295 N·m"):
@@ -197,7 +197,7 @@ def test_a_rated_torque_that_6076h_cannot_hold_is_refused_in_words():
 
 @pytest.mark.parametrize(("speed_limit_rpm", "tenths_rpm"), [(200.0, 5), (250.0, 5), (3000.0, 45)])
 def test_a_fast_drive_has_a_higher_velocity_threshold(bench: Open, speed_limit_rpm: float, tenths_rpm: int) -> None:
-    """606Fh. The threshold of a slow drive is below the noise of a servo: it would never report standstill."""
+    """606Fh of a slow drive is below the noise of a servo, which would never report standstill."""
     drive = QUIET_RIG.drive.model_copy(update={"speed_limit_rpm": speed_limit_rpm})
     _, host = bench(QUIET_RIG.model_copy(update={"drive": drive}))
     assert host.read(0x606F) == tenths_rpm

@@ -12,7 +12,7 @@ from sim_bus.plant.rigid import Params, ShaftState, step
 
 
 def torque_at(time_s: float) -> float:
-    """Start, reversal, stick: constant over each 2 ms step, so that both integrations see the same torque."""
+    """Return the torque for start, reversal and standstill, constant over each 2 ms step for both integrations."""
     if time_s < 1.0:
         return 250.0
     if time_s < 3.0:
@@ -30,7 +30,7 @@ def simulate(params: Params, end_s: float = 7.0, dt_s: float = 0.002) -> tuple[n
 
 
 def independent(params: Params, times: np.ndarray) -> np.ndarray:
-    """Coulomb by events at zero speed, Dahl directly; own equations, RK45 at rtol 1e-10, piecewise in torque."""
+    """Integrate own equations by RK45 (rtol 1e-10), piecewise in torque: Coulomb by events, Dahl directly."""
     J, B, F, sigma = params.inertia_kg_m2, params.viscous_nm_s_rad, params.coulomb_nm, params.dahl_stiffness_nm_rad
     speed = np.zeros_like(times)
     bristle, omega = 0.0, 0.0
@@ -84,7 +84,7 @@ def test_sticks_exactly_and_without_chatter() -> None:
     assert step(Params(), ShaftState(), 60.1, 0.002).speed_rad_s > 0.0
 
 
-def test_a_step_through_zero_is_as_good_as_many_small_ones() -> None:
+def test_a_step_through_zero_agrees_with_many_small_ones() -> None:
     params = Params()
     for torque in (-300.0, -50.0):
         coarse = step(params, ShaftState(0.003), torque, 0.002)
@@ -119,7 +119,7 @@ def test_energy_is_only_what_the_torque_brought(speed: float, torque: float, fri
 
 @given(speed=st.floats(-1, 1), torque=st.floats(-60, 60))
 @settings(max_examples=60, deadline=None)
-def test_torque_below_friction_always_ends_at_rest(speed: float, torque: float) -> None:
+def test_torque_below_friction_always_ends_at_standstill(speed: float, torque: float) -> None:
     params, state = Params(viscous_nm_s_rad=8.0), ShaftState(speed)
     for _ in range(20000):
         state = step(params, state, 0.9 * torque, 0.002)

@@ -1,4 +1,4 @@
-"""plant.yaml: every kind loads, says what is wrong, is documented, and turns behind the CANopen face."""
+"""plant.yaml: every kind loads, reports errors, is documented, and turns with the CANopen interface."""
 
 import csv
 import re
@@ -26,7 +26,7 @@ KINDS = {"plant.yaml": Params, "plant_two_mass.yaml": TwoMassParams, "plant_stri
 
 
 def defaults(model: type[BaseModel], prefix: str = "") -> dict[str, set[Any]]:
-    """Dotted key → its defaults; more than one where the kinds of plant differ."""
+    """Return dotted key → its defaults; several if the kinds of plant differ."""
     found: dict[str, set[Any]] = {}
     for name, field in model.model_fields.items():
         parts = [part for part in (field.annotation, *get_args(field.annotation))
@@ -80,7 +80,7 @@ def test_no_example_is_missing_here() -> None:
     assert {path.name for path in (ROOT / "examples").glob("plant*.yaml")} == set(KINDS)
 
 
-def test_a_file_from_before_there_were_kinds_is_rigid() -> None:
+def test_a_file_without_a_kind_is_rigid() -> None:
     rig = parse_model("plant:\n  inertia_kg_m2: 50\n  friction: dahl\n", "plant.yaml", RigParams)
     assert rig.plant == Params(inertia_kg_m2=50.0, friction="dahl")
     assert RigParams(plant={"coulomb_nm": 0.0}).plant == Params(coulomb_nm=0.0)  # type: ignore[arg-type]
@@ -98,7 +98,7 @@ def test_a_file_from_before_there_were_kinds_is_rigid() -> None:
     ("friction: stribeck\n  static_nm: 10", "plant.static_nm: breakaway torque can't be below coulomb_nm (60)"),
     ("kind: string\n  length_m: 1", "plant.length_m: waves would take"),
 ])
-def test_what_is_wrong_is_said_at_its_line(text: str, says: str) -> None:
+def test_errors_are_reported_at_their_line(text: str, says: str) -> None:
     with pytest.raises(DataFileError) as caught:
         parse_model(f"plant:\n  {text}\n", "plant.yaml", RigParams)
     assert says in str(caught.value)
@@ -117,8 +117,8 @@ def test_every_plant_keeps_the_one_protocol(params: Any) -> None:
 
 
 @pytest.mark.heavy
-def test_two_masses_turn_behind_the_canopen_face(bench: Callable[..., Any], tmp_path: Path) -> None:
-    """Speed mode; the trace shows the motor's shaft, not the bottom's."""
+def test_two_masses_turn_with_the_canopen_interface(bench: Callable[..., Any], tmp_path: Path) -> None:
+    """The trace in speed mode shows the shaft of the motor, not that of the bottom."""
     drive = DriveParams(rated_torque_nm=10_000.0, torque_limit_nm=8000.0, speed_gain_nm_s_rad=3000.0,
                         speed_integral_gain_nm_rad=2000.0)
     rig = RigParams(plant=TwoMassParams(), noise=QUIET, reporting=FAITHFUL, drive=drive)
@@ -128,20 +128,20 @@ def test_two_masses_turn_behind_the_canopen_face(bench: Callable[..., Any], tmp_
     motor, bottom, reported = [0.0], [0.0], []
     for _ in range(2000):
         reported.append(host.cycle(velocity=300)[2] * 2.0 * np.pi / 600.0)
-        host.read(0x1000)                                     # answered after the step: nothing moves meanwhile
+        host.read(0x1000)                                     # the reply comes after the step: no motion in between
         state = simulated.simulator.node.inverter.state
         motor.append(state.speed_rad_s)
         bottom.append(state.bottom_speed_rad_s)
     assert motor[-1] == pytest.approx(np.pi, rel=0.05)
     assert np.max(np.abs(np.subtract(motor, bottom))) > 1.0           # the run-up twists the string
-    assert np.allclose(reported[1:], motor[1:-1], atol=0.02)          # SYNC samples, then time goes on
+    assert np.allclose(reported[1:], motor[1:-1], atol=0.02)          # SYNC samples, then time advances
     simulated.close()
     with (tmp_path / "trace.csv").open(encoding="utf-8") as stream:
         traced = [float(row["speed_rad_s"]) for row in csv.DictReader(stream) if not row["event"]]
     assert np.allclose(traced[-2000:], motor[1:], rtol=1e-5, atol=1e-7)
 
-def test_a_load_at_the_bottom_is_felt_at_the_motor_one_wave_later() -> None:
-    """And it moves two masses as the spring lets it; what happens at the motor stays as it is without one."""
+def test_a_load_at_the_bottom_affects_the_motor_after_one_travel_time() -> None:
+    """Two masses move according to the spring. Before the wave arrives, the motor moves as without the load."""
     params = StringParams(length_m=500.0, drag_nm_s_rad_m=0.0, coulomb_nm=0.0, bottom=Bottom(coulomb_nm=0.0))
     plant = build(params)
     calm = loaded = plant.rest()
@@ -177,15 +177,15 @@ def test_what_disturbs_the_motor_is_the_same_with_a_load_at_the_bottom() -> None
     )
     for one in (with_one, without):
         one.state = one.state._replace(bottom_speed_rad_s=5.0)
-    for _ in range(50):                  # before anything of the bottom's comes up
+    for _ in range(50):                  # before a wave from the bottom arrives
         with_one.step(0.002)
         without.step(0.002)
     assert with_one.speed_rad_s == without.speed_rad_s
     assert with_one.state.bottom_speed_rad_s != without.state.bottom_speed_rad_s
 
 
-def test_a_bit_at_rest_does_not_swing_the_string() -> None:
-    """The random load of a bit comes from cutting. A string that hangs at rest has a motor without torque."""
+def test_a_bit_at_standstill_does_not_excite_the_string() -> None:
+    """The random load of a bit comes from cutting. With a string at standstill the motor has no torque."""
     drive = Inverter(RigParams(plant=StringParams(), noise=NoiseParams(bottom_load_nm=500.0, load_nm=0.0)),
                      np.random.default_rng(3))
     for _ in range(1000):

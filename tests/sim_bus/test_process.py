@@ -1,4 +1,4 @@
-"""The hub with stock clients, and the simulator as a process of its own."""
+"""Hub with standard clients, and the simulator as a separate process."""
 
 import os
 import signal
@@ -54,7 +54,7 @@ def test_words() -> None:
     assert frame_word(WireFrame(0x80, False, b""), 1.5) == b"< frame 080 1.500000  >"
 
 
-def test_two_stock_clients_and_one_that_dies() -> None:
+def test_two_standard_clients_and_one_that_is_lost() -> None:
     hub = Hub()
     with serving(hub):
         first, second, third = client(hub.port), client(hub.port), client(hub.port)
@@ -92,7 +92,7 @@ def test_a_babbler_is_dropped_and_a_wrong_channel_refused() -> None:
             assert b"error" in other.recv(64)
 
 
-def test_port_of_the_hub_tells_when_the_last_client_left() -> None:
+def test_the_port_of_the_hub_reports_when_the_last_client_left() -> None:
     port = HubPort(hub := Hub())
     try:
         ready = threading.Event()
@@ -180,7 +180,7 @@ def test_plant_and_inverter_need_no_bus() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=HOME, check=False).returncode == 0
 
 
-def test_no_thread_is_left_and_failures_come_out(tmp_path: Path) -> None:
+def test_no_thread_is_left_and_failures_are_raised(tmp_path: Path) -> None:
     before = threading.active_count()
     with EmbeddedSimulator() as simulated:
         assert threading.active_count() == before + 1
@@ -200,7 +200,7 @@ def test_own_time_follows_the_wall_clock() -> None:
         every_20_ms = struct.pack("<BHBI", 0x2B, 0x1017, 0, 20)
         bus.send(can.Message(arbitration_id=0x601, data=every_20_ms, is_extended_id=False))
         beats = 0
-        while beats < 5:                                          # nobody sends SYNC
+        while beats < 5:                                          # no SYNC
             message = bus.recv(HANGS_S)
             assert message is not None
             beats += message.arbitration_id == 0x701 and bytes(message.data) == b"\x7f"

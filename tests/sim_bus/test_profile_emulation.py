@@ -1,4 +1,4 @@
-"""The simulated drive in the clothes of a profile, seen by a host by hand: raw frames, no driver."""
+"""Simulated drive with a profile, checked by a host by hand: raw frames, no driver."""
 
 import struct
 from collections.abc import Callable
@@ -25,7 +25,7 @@ def guard(host: Any) -> bytes:
 
 
 def map_pdo(host: Any, communication: int, mapping: int, cob: int, entries: tuple[int, ...]) -> None:
-    """Off, emptied, filled, at every SYNC, on (CiA 301)."""
+    """Disable, clear, map and enable a PDO at every SYNC (CiA 301)."""
     host.write(communication, 1, cob | 1 << 31, 4)
     host.write(mapping, 0, 0, 1)
     for number, entry in enumerate(entries, 1):
@@ -36,7 +36,7 @@ def map_pdo(host: Any, communication: int, mapping: int, cob: int, entries: tupl
 
 
 def s120_in_motion(host: Any) -> None:
-    """RPDO1 6040 + 60FF, TPDO1 6041 + 5810 + 606C at every SYNC, 10 ms each; turning at one turn a second."""
+    """Turn at one turn per second with RPDO1 6040 + 60FF, TPDO1 6041 + 5810 + 606C at every SYNC of 10 ms."""
     for communication, mapping, cob, entries in (
         (0x1400, 0x1600, 0x201, (0x60400010, 0x60FF0020)),
         (0x1800, 0x1A00, 0x40000181, (0x60410010, 0x58100010, 0x606C0020)),
@@ -86,14 +86,14 @@ def test_absent_objects_are_absent(bench: Open, name: str, absent: tuple[int, ..
         assert host.refused(0x1A00, 1, index << 16 | 16, 4) == 0x06020000
 
 
-def test_without_a_profile_nothing_is_guarded_and_everything_is_there(bench: Open) -> None:
+def test_without_a_profile_there_is_no_guarding_and_all_objects_exist(bench: Open) -> None:
     _, host = bench()
     host.bus.send(can.Message(arbitration_id=0x701, is_remote_frame=True, dlc=1, is_extended_id=False))
     assert host.read(0x6076) == 1_000_000
     assert not [data for can_id, data in host.heard if can_id == 0x701]
 
 
-def test_answers_toggle_and_tell_the_state(bench: Open) -> None:
+def test_replies_toggle_and_contain_the_state(bench: Open) -> None:
     _, host = bench(profile=load_canopen_profile(S120))
     assert [guard(host).hex() for _ in range(3)] == ["7f", "ff", "7f"]
     host.nmt(1)
@@ -102,8 +102,8 @@ def test_answers_toggle_and_tell_the_state(bench: Open) -> None:
     assert guard(host) == b"\x84"
     host.nmt(130)
     assert host.wait(0x701) == b"\0"
-    assert guard(host) == b"\x7f"                                          # the toggle begins anew
-    host.write(0x1017, 0, 100, 2)                                          # a heartbeat takes the place of guarding
+    assert guard(host) == b"\x7f"                                          # the toggle restarts
+    host.write(0x1017, 0, 100, 2)                                          # a heartbeat replaces guarding
     host.bus.send(can.Message(arbitration_id=0x701, is_remote_frame=True, dlc=1, is_extended_id=False))
     host.read(0x1000)
     assert not [data for can_id, data in host.heard if can_id == 0x701]
@@ -116,7 +116,7 @@ def test_answers_toggle_and_tell_the_state(bench: Open) -> None:
     (2, ["host's node guarding lost", "state: switch on disabled"]),
 ])
 def test_a_silent_host_stops_the_shaft(bench: Open, tmp_path: Path, reaction: int, events: list[str]) -> None:
-    """By the true shaft's trace, with the simulator running on in its own time once nobody sends any more."""
+    """The trace of the true shaft shows it. The simulator continues in its own time after the last frame."""
     path = tmp_path / "trace.csv"
     simulated, host = bench(profile=load_canopen_profile(S120), trace=path)
     host.write(0x100C, 0, 50, 2)
@@ -125,14 +125,14 @@ def test_a_silent_host_stops_the_shaft(bench: Open, tmp_path: Path, reaction: in
     s120_in_motion(host)
     assert simulated.simulator.speed_rad_s == pytest.approx(6.2831853, abs=0.05)
     begin_s = simulated.simulator.time_s
-    simulated.simulator._time.silence_s = 0.05          # from here on: before, a busy computer's host may take his time
+    simulated.simulator._time.silence_s = 0.05          # from here on; before, the host on a busy computer may be slow
     wait_for("the stop", lambda: abs(simulated.simulator.speed_rad_s) <= (0.05 if reaction != 2 else 5.9))
     wait_for("what comes of it", lambda: f",{events[-1]}\n" in path.read_text(encoding="utf-8"))
     simulated.close()
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
     seen = [(float(row[0]), row[4]) for row in rows if row[4] in events]
     assert [event for _, event in seen] == events
-    assert seen[0][0] - begin_s == pytest.approx(0.2, abs=0.11)       # life time 50 ms x 4 after the last question
+    assert seen[0][0] - begin_s == pytest.approx(0.2, abs=0.11)       # life time 50 ms x 4 after the last request
     if reaction != 2:
         assert abs(float(rows[-1][1])) < 0.05
         assert seen[-1][0] - seen[0][0] < 6.2832 / 3.0 + 1.5                # the quick-stop ramp of 3 rad/s²
@@ -142,7 +142,7 @@ def test_a_silent_host_stops_the_shaft(bench: Open, tmp_path: Path, reaction: in
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("guard_ms", "factor"), [(0, 4), (50, 0), (0, 0)])
-def test_guarding_that_is_not_set_watches_nobody(bench: Open, guard_ms: int, factor: int) -> None:
+def test_guarding_that_is_not_set_has_no_effect(bench: Open, guard_ms: int, factor: int) -> None:
     simulated, host = bench(profile=load_canopen_profile(S120))
     host.write(0x100C, 0, guard_ms, 2)
     host.write(0x100D, 0, factor, 1)
@@ -168,7 +168,7 @@ def test_settings_of_32_bit_floats(bench: Open) -> None:
     assert host.read(0x6072) == 0x43160000
 
 
-def test_reset_gives_the_settings_back(bench: Open) -> None:
+def test_reset_restores_the_settings(bench: Open) -> None:
     simulated, host = bench(profile=load_canopen_profile(S120))
     host.write(0x6072, 0, 0x43160000, 4)
     host.nmt(129)
@@ -206,19 +206,19 @@ def test_another_reaction_object_and_filters(bench: Open) -> None:
 
 
 def test_an_encoder_that_the_profile_does_not_know(bench: Open) -> None:
-    """A profile begun from an EDS without values: some encoder, rather than a division by zero."""
+    """A profile from an EDS without values gets a default encoder, without a division by zero."""
     data = load_canopen_profile("elmo/gold").model_dump()
     data["parameters"] = tuple(one | {"default": None} for one in data["parameters"])
     simulated, host = bench(profile=CanopenProfile.model_validate(data))
     assert (host.read(0x608F, 1), host.read(0x608F, 2)) == (4096, 1)
     store, turned = simulated.simulator.node.store, simulated.simulator.node.application.inverter
     turned.state = turned.state._replace(angle_rad=2.5 * 6.283185307179586)
-    assert store.live[0x606400]() == 2.5 * 4096             # and the angle counts in it
+    assert store.live[0x606400]() == 2.5 * 4096             # and the angle uses its counts
 
 
 @pytest.mark.heavy
 def test_velocity_mode_follows_its_setpoint_only_where_it_is_released(bench: Open) -> None:
-    """CiA 402-2, vl: bits 4 (ramp enabled), 5 (not locked) and 6 (reference used) of the controlword, by raw frames."""
+    """Velocity mode (CiA 402-2): bits 4 (ramp enabled), 5 (not locked) and 6 (reference used) of the controlword."""
     simulated, host = bench(profile=load_canopen_profile("abb/acs880-fcan"))
     for communication, mapping, cob, entries in (
         (0x1400, 0x1600, 0x201, (0x60400010, 0x60420010)),
@@ -244,7 +244,7 @@ def test_velocity_mode_follows_its_setpoint_only_where_it_is_released(bench: Ope
     assert rpm == 60
     assert simulated.simulator.speed_rad_s == pytest.approx(6.2831853, abs=0.05)
     for _ in range(1500):
-        cycle(0x3F, 60)                                     # the reference isn't used any more
+        cycle(0x3F, 60)                                     # the reference is no longer used
     assert abs(simulated.simulator.speed_rad_s) < 0.05
     assert host.refused(0x6060, 0, 3, 1) != 0
     assert host.refused(0x60FF, 0, 0, 4) == 0x06020000

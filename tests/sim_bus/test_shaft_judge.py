@@ -1,4 +1,4 @@
-"""The judge of a run with a lying drive: each rule on traces made by hand. And which runs it is asked about."""
+"""Judge of a run with false reports: each rule on traces made by hand, and the set of runs."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ FINE = ProcessOutcome(0, True, 20.0, "valid", 95.0, 105.0, removed=False, log_cl
 
 
 def shaft(speeds, *, disabled_s=(20.0,), stop_s=10.0):
-    """Speed by knots of (time, speed), every 10 ms up to 30 s."""
+    """Return a shaft with the speed interpolated between (time, speed), every 10 ms up to 30 s."""
     time_s = np.arange(0.0, 30.0, 0.01)
     speed = np.interp(time_s, [t for t, _ in speeds], [w for _, w in speeds])
     return TrueShaft(time_s, speed, np.zeros_like(time_s), time_s < 20.0, disabled_s, stop_s)
@@ -38,7 +38,7 @@ def otherwise(**changes):
     (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True), RIG, ""),
     (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True),
      JudgedMachine(100.0, 20.0, 380.0, 100.0, string=True), "a"),
-    (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True),      # beyond its limit: decision 0024
+    (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True),      # above its limit: decision 0024
      JudgedMachine(100.0, 20.0, 380.0, 10.0, string=True), ""),
     (COASTS, otherwise(code=8, at_rest=False, seen_s=None, removed=True), RIG, "a"),
     (TURNED, otherwise(low_total=50.0, high_total=99.0), RIG, "c"),
@@ -56,12 +56,12 @@ def test_each_rule(turned, outcome, rig, rules):
     assert not judged.excused
 
 
-def test_what_is_not_asked_is_excused_and_told():
+def test_rules_that_do_not_apply_are_excused_and_reported():
     judged = judge(COASTS, otherwise(low_total=150.0, high_total=160.0), RIG, not_asked=frozenset("c"))
     assert set(judged.broken) == {"a", "b"} and set(judged.excused) == {"c"}
 
 
-def test_a_change_of_scale_that_the_run_says_it_cannot_show_is_excused():
+def test_a_change_of_scale_that_the_run_states_as_undetectable_is_excused():
     outcome = otherwise(low_total=101.0, high_total=120.0, least_scale_change=0.15)
     assert judge(TURNED, outcome, RIG, scale_change=0.11).excused.keys() == {"c"}
     assert judge(TURNED, outcome, RIG, scale_change=0.2).broken.keys() == {"c"}
@@ -69,14 +69,14 @@ def test_a_change_of_scale_that_the_run_says_it_cannot_show_is_excused():
     assert judge(TURNED, otherwise(low_total=101.0), RIG, scale_change=0.01).broken.keys() == {"c"}
 
 
-def test_only_a_scale_that_changes_in_mid_run_has_a_change():
+def test_only_a_scale_that_changes_during_a_run_has_a_change():
     changes = [(one.told, one.moment, one.scale_change) for one in product()]
     assert all(change is None for lie, moment, change in changes
                if moment in ("", "setup+2s") or not lie.name.endswith(("-scale", "torque-constant")))
     assert {round(change, 3) for lie, _, change in changes if change and lie.value == "0.9"} == {0.111}
 
 
-def test_the_reaction_that_was_used_is_told():
+def test_the_reaction_is_reported():
     fast = shaft([(0, 0), (5, 13.0), (14, 0)])
     assert judge(fast, FINE, RIG).reaction_s == pytest.approx(0.5)       # 2 rad/s beyond 11, at 4 rad/s²
     assert "d" in judge(fast, FINE, RIG, reaction_s=0.4).broken
@@ -110,12 +110,12 @@ def test_a_shaft_is_read_from_a_trace(tmp_path):
     ({}, "required: the shaft at standstill, or the loss of it reported", (False, None, None, -np.inf, False)),
     (None, "", (False, None, None, -np.inf, False)),
 ])
-def test_an_outcome_is_read_from_what_a_process_said(document, said, expected):
+def test_an_outcome_is_read_from_the_output_of_a_process(document, said, expected):
     one = outcome_of(0, document, said, log_closed=True)
     assert (one.at_rest, one.seen_s, one.verdict, one.low_total, one.removed) == expected
 
 
-# -- which runs ------------------------------------------------------------------------------------------------
+# -- set of runs ----------------------------------------------------------------------------------------------------
 
 
 def test_every_lie_is_in_the_standard_and_at_least_500_runs_are():
@@ -131,7 +131,7 @@ def test_a_sample_is_seeded_and_its_numbers_are_those_of_the_product():
     assert all(product()[one.number] is one for one in sample(50, 3))
 
 
-def test_faults_are_scripted_as_both_buses_take_them():
+def test_faults_are_scripted_in_the_syntax_of_both_buses():
     from sim_bus.canopen.faults import parse_all
     from sim_bus.modbus.faults import parse_all as parse_modbus
 
@@ -141,13 +141,13 @@ def test_faults_are_scripted_as_both_buses_take_them():
         parse_modbus(texts, "embedded") if one.program.modbus else parse_all(texts)
 
 
-def test_what_cannot_be_known_is_a_small_part_and_each_reason_has_its_runs():
+def test_undetectable_errors_are_few_and_each_reason_has_its_runs():
     for blind in UNKNOWABLE:
         assert any(blind.holds(one.told, one.moment, one.program) for one in product()), blind.words
     found = [one for one in product() if unknowable(one)]
-    # the rest is asked for every rule; of those named, most are asked for the others
+    # all rules apply to the rest; to those named, most other rules apply
     assert len(found) < 0.15 * len(product())
     later = [one for one in found if one.moment not in {"", "setup+2s"} and "c" in unknowable(one).rules]
-    assert not later, "a J that is wrong by a change in mid-run is never excused"
+    assert not later, "an error of J from a change during the run is never excused"
     reported = [one for one in product() if one.told.name == "torque-scale" and unknowable(one)]
     assert reported and not any(one.program.torque_mode or one.program.demand for one in reported)

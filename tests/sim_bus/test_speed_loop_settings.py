@@ -1,4 +1,4 @@
-"""The simulated drive shows the gains of its own speed loop, and a host can't change them. No driver is used."""
+"""Gains of the speed loop in the simulated drive: a host can read but not change them. No driver is used."""
 
 import struct
 
@@ -23,7 +23,7 @@ def test_as_objects(bench, profile):
     assert host.refused(0x5FFD, 1, 0, 4) == 0x06010002                     # read only
 
 
-def test_another_profile_has_no_such_object_of_ours(bench):
+def test_another_profile_does_not_have_these_objects(bench):
     _, host = bench(profile=load_canopen_profile("maxon/epos4"))
     assert host.refused(0x5FFD, 1, 0, 4) == 0x06020000
 

@@ -2,7 +2,7 @@ import pytest
 
 from sim_bus.cia402 import STATUS, DeviceCommand, State, decode, fault_reset_edge, next_state
 
-# Typed from CiA 402-2's table of transitions: number, from, command, to.
+# From the table of transitions in CiA 402-2: number, from, command, to.
 TABLE = """
  2 SWITCH_ON_DISABLED SHUTDOWN        READY
  3 READY              SWITCH_ON       SWITCHED_ON

@@ -1,4 +1,4 @@
-"""The paper's figure 7 against its closed forms, and a bit that sticks and slips."""
+"""Two masses of the paper's figure 7, compared with closed forms, and a bit in stick-slip."""
 
 import math
 
@@ -20,14 +20,14 @@ SMOOTH = TwoMassParams(inertia_kg_m2=JR, stiffness_nm_rad=K, damping_nm_s_rad=C,
 
 
 def impedance(hz: float, c: float = C, br: float = 200.0, bl: float = 30.0) -> complex:
-    """Torque over speed at the motor."""
+    """Return torque over speed at the motor."""
     s = 2j * math.pi * hz
     spring, low = K / s + c, JL * s + bl
     return JR * s + br + spring * low / (spring + low)
 
 
 def measured(params: TwoMassParams, hz: float, settle_s: float = 150.0) -> tuple[float, complex]:
-    """(frequency, torque over speed) in steady state, from whole periods of sampled means."""
+    """Return (frequency, torque over speed) in steady state, from whole periods of sampled means."""
     count = round(1.0 / hz / DT)
     hz = 1.0 / (count * DT)
     state, torques, speeds = TwoMassState(), [], []
@@ -54,7 +54,7 @@ def test_impedance(hz: float) -> None:
 
 @pytest.mark.heavy
 def test_resonance_and_antiresonance_are_those_of_the_closed_form() -> None:
-    """Free swing: √(k(1/J_r + 1/J_L)); bottom swinging on a held motor: √(k/J_L)."""
+    """Resonance of the free system: √(k(1/J_r + 1/J_L)). Antiresonance, with the motor held: √(k/J_L)."""
     free = SMOOTH.model_copy(update={
         "damping_nm_s_rad": 0.0, "viscous_nm_s_rad": 0.0,
         "bottom": SMOOTH.bottom.model_copy(update={"viscous_nm_s_rad": 0.0})})
@@ -121,7 +121,7 @@ def test_energy_is_only_what_the_torque_brought(speed: float, low: float, drive:
 
 
 def test_stick_slip_agrees_with_an_integration_between_its_events() -> None:
-    """A bit on Coulomb friction is torn loose, sticks, and is torn loose again; own equations."""
+    """A bit with Coulomb friction breaks away, sticks, and breaks away again, by independent equations."""
     dry, spans = 600.0, ((0.0, 10.0, 620.0), (10.0, 20.0, 0.0), (20.0, 30.0, 900.0))
     params = TwoMassParams(coulomb_nm=0.0, viscous_nm_s_rad=0.0, bottom=Bottom(coulomb_nm=dry, viscous_nm_s_rad=10.0))
     times = np.arange(15_001) * DT
@@ -175,7 +175,7 @@ def test_the_bit_sticks_and_slips_at_low_speed_only(speed: float, sticks: bool) 
         assert np.ptp(bit) < 0.01
 
 
-def test_ends_too_stiffly_joined_are_refused_with_the_cure() -> None:
+def test_ends_with_a_too_stiff_spring_are_refused_with_a_remedy() -> None:
     with pytest.raises(ValueError, match=r"swing at 5\.78e\+04 rad/s.*kind: rigid"):
         TwoMassParams(stiffness_nm_rad=1e12)
     with pytest.raises(ValueError, match=r"damping_nm_s_rad: it would damp"):
@@ -210,5 +210,5 @@ def test_play_against_an_integrator() -> None:
     assert min(twists) < -0.005 and max(twists) > 0.005
     assert spring_torque(LOOSE, TwoMassState(angle_rad=0.004)) == 0.0
     assert spring_torque(LOOSE, TwoMassState(angle_rad=0.006)) == pytest.approx(100.0)
-    # a flank pushes: a motor that backs away from it feels nothing
+    # a flank only pushes: a motor that moves away has no contact
     assert spring_torque(LOOSE, TwoMassState(speed_rad_s=-5.0, angle_rad=0.006)) == 0.0

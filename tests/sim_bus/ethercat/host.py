@@ -1,4 +1,4 @@
-"""An EtherCAT master by hand, over the pure function of the simulated drive: struct only, no code of either side."""
+"""EtherCAT master by hand over the pure function of the simulated drive: struct only, no code of either side."""
 
 import struct
 
@@ -29,7 +29,7 @@ def frame(*datagrams: bytes) -> bytes:
 
 
 class Host:
-    """``now_s`` is the host's own clock; a frame takes none of it."""
+    """Host with the clock ``now_s``; a frame takes no time."""
 
     def __init__(self, *faults: str, stepped: bool = True, rig: RigParams = QUIET_RIG, alias: int = 0,
                  profile: EthercatProfile | None = None) -> None:
@@ -41,7 +41,7 @@ class Host:
         self.counter = 0
 
     def ask(self, command: int, address: tuple[int, int] | int, data: bytes) -> tuple[bytes, int]:
-        """What comes back for one datagram: its data and its working counter; None, 0 for a lost frame."""
+        """Return data and working counter of the reply to one datagram; None, 0 for a lost frame."""
         answer = self.simulator.answer(frame(datagram(command, address, data)), self.now_s)
         if not answer:
             return b"", 0
@@ -63,7 +63,7 @@ class Host:
     # -- states
 
     def state(self, wanted: int) -> tuple[int, int]:
-        """AL status and its code after a request."""
+        """Return AL status and code after a request."""
         self.write(0x0120, wanted)
         return self.read(0x0130), self.read(0x0134)
 
@@ -87,7 +87,7 @@ class Host:
         return self
 
     def safeop(self, outputs: int = 10, inputs: int = 14) -> "Host":
-        """Outputs and inputs share the logical addresses from 0, as with one LRW."""
+        """Enter SAFEOP. Outputs and inputs share the logical addresses from 0, as with one LRW."""
         for number, (start, size, control) in enumerate(((0x1200, outputs, 0x64), (0x1400, inputs, 0x20)), 2):
             self.ask(FPWR, (STATION, 0x0800 + 8 * number), struct.pack("<HHBBBB", start, size, control, 0, 1, 0))
         for number, (start, size, kind) in enumerate(((0x1200, outputs, 2), (0x1400, inputs, 1))):
@@ -168,7 +168,7 @@ class Host:
 
 
 def running(*faults: str, period_us: int = 4000, stepped: bool = True, rig: RigParams = QUIET_RIG) -> Host:
-    """A host whose drive is in OPERATIONAL; outputs 6040 6060 gap 6071 60FF, inputs 6041 6061 gap 6077 606C 6064."""
+    """Return a host with drive in OPERATIONAL; outputs 6040 6060 gap 6071 60FF, inputs 6041 6061 gap 6077 606C 6064."""
     host = Host(*faults, stepped=stepped, rig=rig).preop()
     host.download(0x5FFE, 3, period_us, 4)
     return host.safeop().op()
@@ -179,7 +179,7 @@ def outputs(word: int, mode: int, torque: int = 0, speed: int = 0) -> bytes:
 
 
 def inputs(data: bytes) -> tuple[int, int, int, int, int]:
-    """Statusword, mode, torque in ‰, speed in 0.1 rpm, position."""
+    """Return statusword, mode, torque in ‰, speed in 0.1 rpm, and position."""
     return struct.unpack_from("<HbxhiI", data)
 
 

@@ -1,4 +1,4 @@
-"""The slave controller: commands and working counters, registers, SII, states and their codes, watchdog, clock."""
+"""Slave controller: commands and working counters, registers, SII, states and their codes, watchdog, clock."""
 
 import struct
 
@@ -38,13 +38,13 @@ from tests.sim_bus.ethercat.host import (
     (BRW, 0, 3, 1), (FPRD, STATION, 1, STATION), (FPRD, 0x1002, 0, 0x1002), (FPRW, STATION, 3, STATION),
     (ARMW, 0, 1, 1), (ARMW, 2, 1, 3), (FRMW, STATION, 1, STATION), (FRMW, 9, 1, 9), (0, 0, 0, 0), (15, 0, 0, 0),
 ])
-def test_each_command_counts_and_moves_the_position_on(command, position, counter, after):
+def test_each_command_counts_and_increments_the_position(command, position, counter, after):
     host = Host().preop()
     answer = host.simulator.answer(frame(datagram(command, (position, 0x0910), bytes(8))), 1.0)
     assert (struct.unpack_from("<H", answer, 18)[0], struct.unpack_from("<H", answer, 34)[0]) == (after, counter)
 
 
-def test_a_frame_keeps_its_length_and_shows_that_a_slave_has_had_it():
+def test_a_frame_keeps_its_length_and_is_marked_by_the_slave():
     host = Host()
     sent = frame(datagram(BRD, (0, 0), bytes(2), more=True), datagram(APRD, (0, 4), bytes(1)))
     answer = host.simulator.answer(sent, 1.0)
@@ -60,13 +60,13 @@ def test_a_broadcast_read_adds_its_bits_to_those_of_others():
     assert Host().ask(BRD, (0, 0x0130), b"\x08\x00") == (b"\x09\x00", 1)
 
 
-def test_what_may_not_be_written_keeps_its_value_and_counts_nothing():
+def test_a_refused_write_keeps_the_value_and_the_counter():
     host = Host().preop()
     assert host.write(0x0000, 0xFFFF) == 0
     assert host.write(0x0130, 8) == 0
     assert host.read(0x0130) == PREOP
     host.write(0x0805, 0xFF, 1)
-    assert host.read(0x0805, 1) == 0          # the mailbox isn't full because the master says so
+    assert host.read(0x0805, 1) == 0          # a master cannot set the mailbox to full
     assert host.ask(FPRD, (STATION, 0x1FFF), bytes(4))[1] == 0
 
 
@@ -93,7 +93,7 @@ def test_the_eeprom_has_a_checksum_identity_and_categories():
     assert host.read(0x0502) & 0x2000        # a write is not acknowledged
 
 
-def test_states_are_entered_one_by_one_and_a_refusal_says_why():
+def test_states_are_entered_one_by_one_and_a_refusal_has_a_code():
     host = Host()
     host.ask(by_hand.APWR, (0, 0x0010), struct.pack("<H", STATION))
     assert host.state(PREOP) == (INIT | 0x10, 0x0016)                 # no mailbox
@@ -128,11 +128,11 @@ def test_process_data_count_for_each_direction():
     assert host.ask(LWR, 0, bytes(10))[1] == 1
     assert host.ask(LRW, 0, bytes(14))[1] == 3
     assert host.ask(LRW, 0x1000, bytes(14))[1] == 0
-    data, counter = host.ask(LRW, 10, bytes(10))       # only inputs lie there
+    data, counter = host.ask(LRW, 10, bytes(10))       # only inputs are there
     assert counter == 1 and data[4:] == bytes(6)
 
 
-def test_stepped_time_moves_with_each_cycle_by_the_period():
+def test_stepped_time_advances_by_the_period_in_each_cycle():
     host = running(period_us=4000)
     before = host.slave.time_us
     for _ in range(5):
@@ -203,7 +203,7 @@ def test_the_clock_follows_the_host_and_takes_an_offset():
     assert stepped.read(0x0910, 8) - before == 4_000_000
 
 
-def test_nothing_random_breaks_it():
+def test_random_frames_do_no_harm():
     import random
 
     host, draw = running(), random.Random(3)

@@ -1,4 +1,4 @@
-"""Scripted faults: what the host sees of each, and that it is over when it is over."""
+"""Scripted faults: observations of the host during each, and the end of each."""
 
 import pytest
 
@@ -49,7 +49,7 @@ def test_lost_frames_take_their_cycle_and_end():
     counters = [counter for _, counter in cycles(host, 800)]
     assert host.slave.time_us == before + 800 * 4000
     lost = [n for n, counter in enumerate(counters) if counter == 0]
-    assert 0.4 < len(lost) / 500 < 0.6                     # on the way there, or back
+    assert 0.4 < len(lost) / 500 < 0.6                     # on the way to the drive, or back
     assert all(counter == 3 for counter in counters[550:])
 
 
@@ -69,14 +69,14 @@ def test_a_wrong_working_counter_leaves_the_data():
 
 
 @pytest.mark.parametrize(("fault", "code"), [("al-error@0.1s=002Ch", 0x2C), ("sm-watchdog@0.1s", 0x1B)])
-def test_the_slave_leaves_operational_and_says_why(fault, code):
+def test_the_slave_leaves_operational_with_a_code(fault, code):
     host = enabled(running(fault), 9)
     cycles(host, 40)
     assert (host.read(0x0130), host.read(0x0134)) == (SAFEOP | 0x10, code)
     assert host.slave.application.state.name.startswith("FAULT")
 
 
-def test_garbage_in_the_eeprom_goes_as_it_came():
+def test_garbage_in_the_eeprom_begins_and_ends():
     host = Host("sii-garbage@0.1s/0.1s").preop()
     host.download(0x5FFE, 3, 4000, 4)
     true = host.sii(10)
@@ -88,7 +88,7 @@ def test_garbage_in_the_eeprom_goes_as_it_came():
     assert host.sii(10) == true
 
 
-def test_a_mailbox_that_does_not_answer():
+def test_a_mailbox_that_does_not_reply():
     host = running("mailbox-timeout@0.1s/0.2s")
     cycles(host, 40)
     assert host.mailbox(b"\x00\x20\x40\x41\x60\x00" + bytes(4)) == b""

@@ -1,4 +1,4 @@
-"""Foreign masters judge the slave, a process of its own: SOEM (PyPI's pysoem) and KickCAT over a veth pair.
+"""Foreign masters check the slave in its own process: SOEM (PyPI's pysoem) and KickCAT over a veth pair.
 
 Skipped with the reason where a raw socket, a veth pair or the master is missing; TDHIL_REQUIRE_VETH=1 forbids that.
 """
@@ -33,14 +33,14 @@ def skip(reason: str) -> None:
 
 
 def ip(*words: str) -> str:
-    """What went wrong; '' for nothing."""
+    """Run ip; return the error, or '' without one."""
     done = subprocess.run(["ip", *words], capture_output=True, text=True, timeout=60)
     return done.stderr.strip() if done.returncode else ""
 
 
 @pytest.fixture
 def interface() -> Iterator[str]:
-    """The host's end of a pair whose other end has a simulated drive on it."""
+    """Yield the host's end of a pair with a simulated drive at the other end."""
     if not sys.platform.startswith("linux") or shutil.which("ip") is None:
         skip("it needs Linux and the command ip")
     host, drive = (f"tde{uuid.uuid4().hex[:8]}{end}" for end in "hd")
@@ -83,7 +83,7 @@ def test_soem(interface):
     master.open(interface)
 
     def sdo(transfer, *of):
-        """SOEM gives up a frame after 2 ms, and then the transfer; on a busy computer it is begun again."""
+        """Repeat a transfer on a busy computer, since SOEM abandons a frame after 2 ms, and then the transfer."""
         while True:
             try:
                 return transfer(*of)
@@ -155,7 +155,7 @@ def test_kickcat(interface):
     status = kickcat.mailbox.request.MessageStatus
 
     def patient(act, *of):
-        """KickCAT gives up a frame after its time-out; on a busy computer it is asked again."""
+        """Repeat a call on a busy computer, since KickCAT abandons a frame after its time-out."""
         end_s = time.monotonic() + STARTING_S
         while True:
             try:

@@ -1,4 +1,4 @@
-"""SDO over the mailbox, PDO mapping, and what the process data do to the shaft."""
+"""SDO over the mailbox, PDO mapping, and effect of the process data on the shaft."""
 
 import struct
 
@@ -42,11 +42,11 @@ def test_sdo_expedited_normal_and_segmented():
     (0x6040, 0, 0, 4, 0x06070010), (0x6060, 0, 77, 1, 0x06090030), (0x6072, 0, 65535, 2, 0x06090031),
     (0x1600, 0, 9, 1, 0x06090031), (0x1016, 1, 0, 4, 0x06020000), (0x1C00, 1, 0, 1, 0x06010002),
 ])
-def test_an_abort_says_what_is_wrong(index, sub, value, size, code):
+def test_an_abort_has_the_right_code(index, sub, value, size, code):
     assert Host().preop().refused(index, sub, value, size) == code
 
 
-def test_what_is_no_sdo_is_refused_and_the_server_goes_on():
+def test_an_invalid_sdo_is_refused_and_the_server_continues():
     host = Host().preop()
     for request, code in ((bytes((0x50,)) + b"\x18\x10\x00" + bytes(4), 0x06010000),      # complete access
                           (b"\xe0" + bytes(7), 0x05040001), (b"\x60" + bytes(7), 0x05040001)):
@@ -61,7 +61,7 @@ def test_what_is_no_sdo_is_refused_and_the_server_goes_on():
     assert host.upload(0x6041) == b"\x50\x02"
 
 
-def test_a_message_said_twice_is_done_once_and_a_lost_answer_is_said_again():
+def test_a_duplicate_message_is_executed_once_and_a_lost_reply_is_repeated():
     host = Host().preop()
     message = (struct.pack("<HHBB", 10, 0, 0, 3 | 5 << 4) + b"\x00\x20" + struct.pack("<BHB4x", 0x40, 0x6041, 0))
     for _ in range(2):
@@ -89,7 +89,7 @@ def test_mapping_is_written_in_preop_as_count_entries_count():
     assert host.state(PREOP) == (PREOP, 0) and host.refused(0x1600, 0, 0, 1) == 0
 
 
-def test_two_pdos_stand_behind_one_another():
+def test_two_pdos_follow_each_other():
     host = Host().preop()
     host.download(0x1C13, 0, 0, 1)
     host.download(0x1A01, 1, 0x60740010, 4)
