@@ -34,7 +34,7 @@ PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
 
 def routes(site: Site) -> list[Route]:
     """Return the routes of a run's files."""
-    return apis(site, log, report, report_pdf, result, samples, recording, pictures, picture)
+    return apis(site, log, recovered, report, report_pdf, result, samples, recording, pictures, picture)
 
 
 async def log(site: Site, request: Request, body: None) -> Response:

@@ -132,6 +132,10 @@ def test_downloads_come_in_pieces(client, call, service):
         assert answer.status_code == status
         call.check("GET", f"{API}/runs/{run}/log.mcap", answer)
     call("GET", f"/runs/{run}/report.html", 404)
+    call("GET", f"/runs/{run}/recovered.mcap", 404)
+    (service.store.place(run) / "recovered.mcap").write_bytes(b"copy")     # of a log that broke off
+    assert "recovered.mcap" in call("GET", f"/runs/{run}", 200)["files"]
+    assert call("GET", f"/runs/{run}/recovered.mcap", 200).content == b"copy"
     assert client.head(f"{API}/runs/{run}/result.json").status_code == 200             # displayed, not downloaded
     call("GET", f"/runs/{run}/log.mcap", 200)
     wait_for("the audit", lambda: sum(one.what == "downloaded run.mcap" for one in service.audit.entries()) == 5)
