@@ -49,7 +49,7 @@ def whole_or_none(target: Path) -> Iterator[None]:
     try:
         yield
     except FileExistsError:
-        raise                        # the file of somebody else
+        raise                        # an earlier file, which stays
     except BaseException:
         target.unlink(missing_ok=True)
         raise

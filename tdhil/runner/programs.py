@@ -36,7 +36,7 @@ from tdhil.runner.stages import (
     run_torque,
     slow_down,
 )
-from tdhil.runner.stop import StopSequence
+from tdhil.runner.stop import QuickStopKind, StopSequence
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, Say, Task
 
 HOLD_AUTHORITY = 0.25
@@ -139,12 +139,11 @@ def begin_motion(run: Run) -> None:
         loop,
         limits,
         preflight.speed_resolution_rad_s,
-        preflight.quick_stop_in_torque_mode,
+        QuickStopKind(preflight.quick_stop_in_torque_mode, ends_off=preflight.quick_stop_holds is False),
         run.assumptions,
         torque_resolution_nm=preflight.torque_resolution_nm,
         torque_offset_nm=run.torque_offset_nm,
         watched=preflight.watched,
-        ends_off=preflight.quick_stop_holds is False,
     ))
     loop.guard.start_clock(loop.now_s)
     breakaway_nm = probe_sign(loop, limits, run.mode, preflight.speed_resolution_rad_s)

@@ -237,6 +237,14 @@ _NO_TORQUE_ASKED = Command(Mode.TORQUE, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
+class QuickStopKind:
+    """Quick stop of the drive: whether it brakes in torque mode, and whether the torque is off at its end."""
+
+    in_torque_mode: bool
+    ends_off: bool = False
+
+
+@dataclass(frozen=True)
 class StopReport:
     """Result of the stop. ``confirmed``: the shaft was seen at standstill, and the drive is disabled."""
 
@@ -250,23 +258,19 @@ class StopReport:
 
 
 class StopSequence:
-    """Stop sequence of one run; it runs once, and later calls return its report.
-
-    ``watched``: the watchdog is armed. ``ends_off``: the drive removes its torque at the end of its quick stop.
-    """
+    """Stop sequence of one run; it runs once, and later calls return its report. ``watched``: the watchdog is armed."""
 
     def __init__(
         self,
         loop: ControlLoop,
         limits: MachineLimits,
         speed_resolution_rad_s: float,
-        quick_stop_in_torque_mode: bool,
+        quick_stop: QuickStopKind,
         assumptions: ControlAssumptions | None = None,
         *,
         torque_resolution_nm: float = 0.0,
         torque_offset_nm: float = 0.0,
         watched: bool = True,
-        ends_off: bool = False,
     ) -> None:
         assumptions = assumptions or ControlAssumptions()
         self._loop = loop
@@ -277,9 +281,8 @@ class StopSequence:
         # Three times the ramp from the highest speed, for a drive at its torque limit, and the settling.
         ramp_s = limits.speed_max_rad_s / limits.quick_stop_rad_s2
         self._enough_s = 3.0 * ramp_s + 2.0 * self._settle_s + 1.0
-        self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
+        self._quick_stop = quick_stop
         self._watched = watched
-        self._ends_off = ends_off
         self._string = None
         if limits.has_drill_string:
             self._string = StringReleaseLimits(
@@ -322,7 +325,7 @@ class StopSequence:
 
     def _sequence(self) -> StopReport:
         self._loop.guard.expected = None
-        self._loop.guard.observer.begin_stop(ends_off=self._ends_off)
+        self._loop.guard.observer.begin_stop(ends_off=self._quick_stop.ends_off)
         if self._loop.guard.observer.backwards or self._never_moved:
             coasted = self._coasted()
             if coasted is not None:
@@ -526,7 +529,7 @@ class StopSequence:
             # With a speed signal that does not respond, speed control would continue to hold the flowing torque.
             for _ in range(self._loop.cycles(TORQUE_BACK_S)):
                 self._exchange(Command(Mode.TORQUE, 0.0, 0.0))
-        if self._quick_stop_in_torque_mode:
+        if self._quick_stop.in_torque_mode:
             return None
         # With a string and a believed speed, `_slow_down` has given the drive its time.
         waited = string is not None and not self._speed_doubted and self._in_torque_mode

@@ -164,11 +164,11 @@ class StringRelease:
         if self._reference_nm is None:
             self._reference_nm, self.trapped_nm = abs(held_nm), held_nm
         self._reference_nm = max(0.0, self._reference_nm - self._limits.ramp_nm_s * self._period_s)
-        still = noise or abs(speed_rad_s) <= self._at_rest_rad_s
+        still = abs(speed_rad_s) <= self._at_rest_rad_s
         turned = None not in (position_rad, self._position_rad) and position_rad != self._position_rad
         self._position_rad = position_rad
         self._still_s = self._still_s + self._period_s if still and not turned else 0.0
-        calm = abs(held_nm) <= self._limits.residual_nm and still
+        calm = abs(held_nm) <= self._limits.residual_nm and (still or noise)
         self._quiet_s = self._quiet_s + self._period_s if calm else 0.0
         self._impedance.watch(held_nm, self._period_s, torque_nm if self._still_s < MEAN_S else 0.0)
         # The ramp belongs to the side on which the torque was trapped; torque of the other sign is released at once.

@@ -12,7 +12,7 @@ from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.guard import Guard
 from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.runner.stop import StopSequence
+from tdhil.runner.stop import QuickStopKind, StopSequence
 from tdhil.runner.task import Task
 from tests.rigs import LIMITS
 
@@ -246,10 +246,9 @@ class World:
         self.guard = Guard(limits, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION)
         self.bench = ControlLoop(self.drive, self.guard, self.log, self.stop_request, watch or self.display.cycle)
 
-    def stop_sequence(self, **options) -> StopSequence:
-        return StopSequence(
-            self.bench, self.limits, SPEED_RESOLUTION, self.drive.quick_stop_in_torque_mode, **options
-        )
+    def stop_sequence(self, *, ends_off=False, **options) -> StopSequence:
+        quick_stop = QuickStopKind(self.drive.quick_stop_in_torque_mode, ends_off)
+        return StopSequence(self.bench, self.limits, SPEED_RESOLUTION, quick_stop, **options)
 
     def turn(self, speed: float = 5.0, mode: Mode = Mode.SPEED) -> None:
         """Enable the drive and turn the shaft."""

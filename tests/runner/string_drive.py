@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from drivers.drive import Command, Mode, PowerState
-from tdhil.runner.stop import StopSequence
+from tdhil.runner.stop import QuickStopKind, StopSequence
 from tests.runner.fake_drive import LIMITS, FakeDrive, World
 
 STRING = replace(LIMITS, load="string", torque_ramp_nm_s=20.0)
@@ -63,6 +63,5 @@ class StringWorld(World):
         self.bench.last = self.drive.report()
 
     def stop_sequence(self, **options) -> StopSequence:
-        return StopSequence(
-            self.bench, self.limits, 0.01, self.drive.quick_stop_in_torque_mode, torque_resolution_nm=1.0, **options
-        )
+        quick_stop = QuickStopKind(self.drive.quick_stop_in_torque_mode)
+        return StopSequence(self.bench, self.limits, 0.01, quick_stop, torque_resolution_nm=1.0, **options)
