@@ -244,15 +244,16 @@
         rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, tr("Sign off")) : null));
   }
 
-  async function stopRig(rig) {
-    const late = setTimeout(() => away(tr("Stop of {rig}: standstill is not confirmed yet. If the shaft still turns, use the hard-wired emergency stop.", { rig: rig.name })), SILENT_MS);
+  /** Stop the drive of a rig; ``show`` displays what came of it. */
+  async function stopRig(rig, show = away) {
+    const late = setTimeout(() => show(tr("Stop of {rig}: standstill is not confirmed yet. If the shaft still turns, use the hard-wired emergency stop.", { rig: rig.name })), SILENT_MS);
     try {
       const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, Number(document.body.dataset.stopS) * 1000 + 10000);      // a stop of the drive is answered after standstill
-      away("");
+      show("");
       if (found.runs.length && !found.said) location.assign(`/runs/${found.runs[0]}/live`);
-      else away(`${rig.name}: `, worded(found.said), found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired emergency stop")}`);
+      else show(`${rig.name}: `, worded(found.said), found.exit_code === 0 ? "" : `. ${tr("Use the hard-wired emergency stop")}`);
     } catch (error) {
-      away(`${tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })}${error instanceof Refused ? `. ${error.message}` : ""}`);
+      show(`${tr("Stop of {rig} {problem}", { rig: rig.name, problem: UNDELIVERED })}${error instanceof Refused ? `. ${error.message}` : ""}`);
     } finally {
       clearTimeout(late);
     }
@@ -750,13 +751,23 @@
       if (stop.asked || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
+      if (saidOfRig) return;                  // the result of a stop after the run stays
       const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("NO REPLY FROM THE DRIVE: use the hard-wired emergency stop") : "";
       byId("undelivered").hidden = !text;
       if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
     }
 
+    let saidOfRig = false;
+
+    /** Show what came of a stop of the rig's drive after the run. */
+    function ofRig(...parts) {
+      saidOfRig = parts.some(Boolean);
+      byId("undelivered").replaceChildren(...parts);
+      byId("undelivered").hidden = !saidOfRig;
+    }
+
     byId("stop").addEventListener("click", async () => {
-      if (status && ENDED.includes(status.state)) { await stopRig({ id: status.rig, name: status.rig_name || status.rig }); return; }      // the run is over, its shaft may still turn
+      if (status && ENDED.includes(status.state)) { await stopRig({ id: status.rig, name: status.rig_name || status.rig }, ofRig); return; }      // the run is over, its shaft may still turn
       asking = Date.now();
       stopTimes();
       const late = setTimeout(() => { undelivered = true; stopAlarm(); }, SILENT_MS);
