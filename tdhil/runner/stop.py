@@ -38,7 +38,6 @@ from dataclasses import dataclass
 from drivers import (
     Command,
     CommandRejected,
-    Drive,
     Mode,
     ModeNotConfirmed,
     Polled,
@@ -51,88 +50,12 @@ from drivers import (
 )
 from profiles.quantities import in_nm
 from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.feedback_polls import SLOWING_S, FeedbackPolls, Slowing
 from tdhil.runner.guard import kept_within
 from tdhil.runner.observer import FASTER_SHARE, RUN_OUT_S, Signal
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.standstill import NO_TORQUE, CountsOfNoise, Standstill, standstill_speed
 from tdhil.runner.string_release import MEAN_S, StringRelease, StringReleaseLimits
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Single polls of a drive (`drivers.drive.Polled`) for a stop without credible feedback of the cycle.
-#
-# A poll also feeds the drive's watchdog. So polling must end if the shaft does not slow down: the watchdog acts only
-# if no requests come (`Slowing`).
-
-
-AFTER_S = 0.2
-"""Time without cyclic feedback after which the drive is polled, s."""
-
-EVERY_S, MOST_S = 0.1, 0.4
-"""Interval between two polls, s. It doubles after each poll without an answer, up to the second value."""
-
-SLOWING_S, SLOWER = 1.0, 0.98
-"""Under polls alone: time within which the speed must fall, s, and the share to which it must fall."""
-
-
-class FeedbackPolls:
-    """Polls of the drive, with their timing. ``only``: the cyclic feedback no longer counts."""
-
-    def __init__(self, drive: Drive, period_s: float) -> None:
-        self._drive = drive if isinstance(drive, Polled) else None
-        self._period_s = period_s
-        self._missing_s = 0.0
-        self._due_s = AFTER_S
-        self._pause_s = EVERY_S
-        self.only = False
-        self.answered = 0
-
-    @property
-    def standing(self) -> bool:
-        """Return whether polls replace the cycle's feedback at present."""
-        return self.only or self._missing_s > 0.0
-
-    def heard(self) -> None:
-        """Note that the cycle brought feedback."""
-        self._missing_s, self._due_s, self._pause_s = 0.0, AFTER_S, EVERY_S
-
-    def missed(self) -> Sample | None:
-        """Note a cycle without feedback. Return the drive's answer if a poll was due, or None. May raise."""
-        self._missing_s += self._period_s
-        if self._drive is None or self._missing_s < self._due_s - 1e-9:
-            return None
-        self._due_s = self._missing_s + self._pause_s
-        self._pause_s = min(MOST_S, 2.0 * self._pause_s)
-        return self.ask()
-
-    def ask(self) -> Sample | None:
-        """Poll now. Return the drive's answer, or None without one. May raise."""
-        sample = self._drive.poll() if self._drive is not None else None
-        if sample is not None:
-            self.answered += 1
-            self._due_s, self._pause_s = self._missing_s + EVERY_S, EVERY_S
-        return sample
-
-
-class Slowing:
-    """Test whether a shaft slows down: to the share `SLOWER` of its speed within ``within_s``."""
-
-    def __init__(self, at_rest_rad_s: float, within_s: float = SLOWING_S) -> None:
-        self._at_rest_rad_s = at_rest_rad_s
-        self._within_s = within_s
-        self._since_s: float | None = None
-        self._speed_rad_s = math.inf
-
-    def reset(self) -> None:
-        """Start again with the next sample."""
-        self._since_s = None
-
-    def see(self, time_s: float, speed_rad_s: float) -> bool:
-        """Return False once a turning shaft has not become slower for ``within_s``."""
-        speed_rad_s = abs(speed_rad_s)
-        if self._since_s is None or speed_rad_s <= max(self._at_rest_rad_s, SLOWER * self._speed_rad_s):
-            self._since_s, self._speed_rad_s = time_s, speed_rad_s
-        return time_s - self._since_s < self._within_s
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Longest wait for standstill: the time of the ramp, and beyond it as long as the shaft keeps becoming slower. Pure.
@@ -461,7 +384,7 @@ class StopSequence:
                 return None
             if not self._speed_doubted:
                 return self._coasted()
-            held_nm = math.fsum(self._held) / max(1, len(self._held)) - string.torque_offset_nm
+            held_nm = self._mean_torque_nm - string.torque_offset_nm
             if without_s > TORQUE_GONE_S and abs(held_nm) > 2.0 * string.residual_nm:
                 self._trouble.append(
                     f"the drive still reports {in_nm(held_nm)} {without_s:.1f} s after zero torque was commanded: quick"
@@ -510,7 +433,7 @@ class StopSequence:
         last = self._loop.last
         if self._string is None or not self._held or last is None or last.state in NO_TORQUE:
             return False
-        held_nm = math.fsum(self._held) / len(self._held) - self._string.torque_offset_nm
+        held_nm = self._mean_torque_nm - self._string.torque_offset_nm
         if abs(held_nm) <= 2.0 * self._string.residual_nm:
             return False
         self._trouble.append(
@@ -604,6 +527,11 @@ class StopSequence:
         return self._ended(stays, at_rest_s, disabled)
 
     @property
+    def _mean_torque_nm(self) -> float:
+        """Mean of the last reported torques, N·m; 0 without one."""
+        return math.fsum(self._held) / max(1, len(self._held))
+
+    @property
     def _never_moved(self) -> bool:
         """Return whether, above a string, torque caused no reported motion: speed control could drive the shaft."""
         return self._string is not None and self._in_torque_mode and self._loop.guard.observer.unseen_s > 0.0
@@ -645,7 +573,7 @@ class StopSequence:
             if not braking.see(sample.time_s, speed_rad_s) and self._leave_to_watchdog(sample):
                 patience = StopTimeout(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
             if rest.see(sample, POLLED_GAP_S if self._polls.standing else 0.0) and self._poll_agrees(rest):
-                self._held_at_rest_nm = math.fsum(self._held) / len(self._held)
+                self._held_at_rest_nm = self._mean_torque_nm
                 return sample.time_s
         if observer.doubt is not None and not observer.reports_trusted:
             self._trouble.append(

@@ -6,17 +6,13 @@ import pytest
 
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost
+from tdhil.runner.feedback_polls import AFTER_S, EVERY_S, SLOWING_S, FeedbackPolls, Slowing
 from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stop import (
-    AFTER_S,
-    EVERY_S,
     MODE_S,
     REST_AFTER_S,
     SILENT_S,
-    SLOWING_S,
     UNMOVED_S,
-    FeedbackPolls,
-    Slowing,
 )
 from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive
 from tests.runner.string_drive import StringDrive, StringWorld
