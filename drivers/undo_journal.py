@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any
 
 from drivers.drive import Identity
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.preflight import PreflightTable
 from profiles import MessageCode
 
 PREFIX, SUFFIX = "drive-left-", ".json"
@@ -180,3 +181,28 @@ def read(path: Path) -> tuple[str, tuple[Change, ...]]:
             next_step="Compare the drive's settings with its documents, and remove the file",
             entry=MessageCode.UNDO_FILE_PROBLEM,
         ) from error
+
+
+def restore_left(
+    table: PreflightTable, journal: UndoJournal, changes: Iterable[Change], restore: Callable[[Change], bool]
+) -> bool:
+    """Restore the settings that an earlier run left in the drive because its host died, if they are unchanged.
+
+    ``restore`` writes the former value of a change if the drive still has the later one, and returns whether it did.
+    Return whether a setting was restored.
+    """
+    given, others = [], []
+    for one in changes:
+        try:
+            if restore(one):
+                given.append(one.text)
+            else:
+                others.append(one.where)
+            journal.given_back(one.where)
+        except ObjectRefused as error:
+            table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive")
+    if given:
+        table.note("left by an earlier run", f"{', '.join(given)}: restored now", "log's folder")
+    if others:
+        table.note("left by an earlier run", f"{', '.join(others)}: changed since by another tool, not restored")
+    return bool(given)

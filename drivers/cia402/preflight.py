@@ -31,7 +31,7 @@ from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
 from drivers.speed_loop import ReadSetting, read_speed_loop
 from drivers.standstill import standstill_limit_rad_s
-from drivers.undo_journal import UndoJournal
+from drivers.undo_journal import Change, UndoJournal, restore_left
 from profiles import MARKER_INDEX, MARKER_TEXT, MessageCode
 from profiles.cia402 import Cia402Profile, ReportingFilter
 from profiles.quantities import RAD_S_PER_RPM
@@ -182,22 +182,14 @@ def check_identity(table: PreflightTable, identity: Identity, profile: Cia402Pro
 
 def restore_from(table: PreflightTable, objects: Objects, journal: UndoJournal, identity: Identity) -> None:
     """Restore the settings that an earlier run left in the drive because its host died, if they are unchanged."""
-    given, others = [], []
-    for one in journal.opened(identity):
+    def give_back(one: Change) -> bool:
         index, sub = place(one.where)
-        try:
-            if objects.read_bytes(index, sub) == one.after:
-                objects.write_bytes(index, sub, one.before)
-                given.append(one.text)
-            else:
-                others.append(one.where)
-            journal.given_back(one.where)
-        except ObjectRefused as error:
-            table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive")
-    if given:
-        table.note("left by an earlier run", f"{', '.join(given)}: restored now", "log's folder")
-    if others:
-        table.note("left by an earlier run", f"{', '.join(others)}: changed since by another tool, not restored", "")
+        unchanged = objects.read_bytes(index, sub) == one.after
+        if unchanged:
+            objects.write_bytes(index, sub, one.before)
+        return unchanged
+
+    restore_left(table, journal, journal.opened(identity), give_back)
     objects.journal = journal
 
 

@@ -11,7 +11,7 @@ from drivers.modbus.codec import RegisterType, WordOrder, from_words, register_n
 from drivers.modbus.link import Link
 from drivers.modbus.pdu import BUSY, BadReply, NoReply, RegisterRefused
 from drivers.preflight import PreflightTable
-from drivers.undo_journal import UndoJournal, Undos
+from drivers.undo_journal import Change, UndoJournal, Undos, restore_left
 from profiles.modbus import Register
 
 SETTING_TIMEOUT_S = 1.0
@@ -156,26 +156,18 @@ class RegisterAccess:
 
         Later changes are recorded in the journal. Return whether a register was written.
         """
-        given, others = [], []
-        for one in reversed(journal.opened(identity)):
+        def give_back(one: Change) -> bool:
             address, kind = int(one.where.split()[1]), _TYPES[len(one.before)]
             after, before = (to_words(int.from_bytes(data, "little"), kind, self._order)
                              for data in (one.after, one.before))
-            try:
-                if self.read_words("holding", address, len(after), one.where) == after:
-                    self.write_words(address, before, one.where)
-                    given.append(one.text)
-                else:
-                    others.append(one.where)
-                journal.given_back(one.where)
-            except RegisterRefused as error:
-                table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive")
-        if given:
-            table.note("left by an earlier run", f"{', '.join(given)}: restored now", "log's folder")
-        if others:
-            table.note("left by an earlier run", f"{', '.join(others)}: changed since by another tool, not restored")
+            unchanged = self.read_words("holding", address, len(after), one.where) == after
+            if unchanged:
+                self.write_words(address, before, one.where)
+            return unchanged
+
+        written = restore_left(table, journal, reversed(journal.opened(identity)), give_back)
         self.journal = journal
-        return bool(given)
+        return written
 
 
 def _bytes(register: Register, counts: int) -> bytes:
