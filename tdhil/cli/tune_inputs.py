@@ -37,6 +37,7 @@ def read_result(path: Path) -> Mapping[str, Any]:
     Raises UsageError for a file of another kind, and for a JSON document with intervals of another coverage: all
     tuning draws from intervals of 95 %.
     """
+    from tdhil.report import coverage_of
     from tdhil.session import is_log
 
     require_result(path)
@@ -54,9 +55,8 @@ def read_result(path: Path) -> Mapping[str, Any]:
         raise UsageError("is JSON, but not a result of tdhil identify", where=str(path),
                          next_step="Write one with: tdhil identify --json > result.json",
                          entry=MessageCode.WRONG_KIND_OF_FILE)
-    parts = [one for one in (document["inertia_kg_m2"], document.get("frequency_response")) if isinstance(one, dict)]
-    stated = next((one["confidence"] for one in parts if is_number(one.get("confidence"))), COVERAGE)
-    if abs(float(stated) - COVERAGE) > 1e-9:
+    stated = coverage_of(document)
+    if stated is not None and abs(stated - COVERAGE) > 1e-9:
         raise UsageError(f"its intervals have a coverage of {100.0 * stated:g} %, and 95 % is needed", where=str(path),
                          next_step="Name the log instead, or write it again: tdhil replay run.mcap --confidence 0.95"
                          " --json > result.json", entry=MessageCode.WRONG_KIND_OF_FILE)
@@ -155,6 +155,10 @@ def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
             raise UsageError(f"{key} is not a number", where=f"--impedance {path}",
                              entry=MessageCode.WRONG_KIND_OF_FILE)
     return found
+
+
+REPORTED_FILTER: Final = "the speed filter as the drive reports it; the rest assumed, not measured"
+"""Source of the lags of a loop with a reported filter."""
 
 
 def reported_filter(result: Mapping[str, Any]) -> tuple[float, bool] | None:

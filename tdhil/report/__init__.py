@@ -40,7 +40,9 @@ if TYPE_CHECKING:
         ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_blocks as write_blocks, write_report as write_report,
     )
-    from tdhil.report.intervals import rounded as rounded, with_interval as with_interval
+    from tdhil.report.intervals import (
+        coverage_of as coverage_of, rounded as rounded, with_interval as with_interval,
+    )
     from tdhil.report.letterhead import (
         LONGEST_LINE as LONGEST_LINE, MOST_LINES as MOST_LINES,
         NO_LETTERHEAD as NO_LETTERHEAD, Letterhead as Letterhead, clean_logo as clean_logo,
@@ -90,7 +92,7 @@ else:
         "evaluation": "evaluation_document evaluation_report print_evaluation write_evaluation_report",
         "frequency_response": "draw_bode draw_faults draw_responses print_responses response_sentences save_responses",
         "graphs": "GRAPHS",
-        "intervals": "rounded with_interval",
+        "intervals": "coverage_of rounded with_interval",
         "inertia_scope": "InertiaScope scope_text",
         "html": "ShownPicture check_report_path pictures_in write_blocks write_report",
         "letterhead": "LONGEST_LINE MOST_LINES NO_LETTERHEAD Letterhead clean_logo load_letterhead",

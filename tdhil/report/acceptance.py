@@ -16,7 +16,7 @@ from typing import Any, Final
 from profiles import MessageCode, with_code
 from tdhil.config import ACCEPTED_QUANTITIES, Expectation
 from tdhil.report.inertia_scope import InertiaScope, scope_text
-from tdhil.report.intervals import with_interval
+from tdhil.report.intervals import coverage_of, with_interval
 
 Part = Mapping[str, Any]
 _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
@@ -27,6 +27,7 @@ _SETTINGS: Final = ("torque-limit",)
 
 
 LEAST_COVERAGE: Final = 0.95
+"""Least coverage of an interval that decides on an acceptance."""
 
 
 class AcceptanceVerdict(StrEnum):
@@ -124,8 +125,8 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
             if scope != own:
                 advice = "; expect motor-inertia instead" if scope == InertiaScope.MOTOR_SIDE else ""
                 other = f", which is {scope_text(scope)}, not {scope_text(own)}{advice}"
-        coverage = _coverage(document)
-        if low < high and coverage < LEAST_COVERAGE:
+        coverage = coverage_of(document)
+        if low < high and coverage is not None and coverage < LEAST_COVERAGE:
             other += f", an interval with a coverage of {100.0 * coverage:g} %; acceptance needs 95 % or more"
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
         seen = f"{how} {with_interval(value, low, high, quantity.unit.symbol)}{other}"
@@ -139,12 +140,6 @@ def _at(place: Iterable[str], document: Part) -> Any:
     for key in place:
         part = part.get(key) if isinstance(part, Mapping) else None
     return part
-
-
-def _coverage(document: Part) -> float:
-    """Return the coverage of the document's intervals, as a share; that of the default without an inertia."""
-    stated = _at(("inertia_kg_m2", "confidence"), document)
-    return float(stated) if isinstance(stated, int | float) else LEAST_COVERAGE
 
 
 def _identified(name: str, part: Any, document: Part) -> tuple[float | None, float | None, float | None]:

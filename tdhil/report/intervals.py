@@ -13,6 +13,19 @@ ASYMMETRIC = 1.2
 less than a tenth wider than the interval."""
 
 
+def coverage_of(document: Mapping[str, Any]) -> float | None:
+    """Return the coverage of the intervals of a result's document, as a share; None if it is not stated.
+
+    A result without J, as of a run that measures the drive's impedance, states it with its frequency response.
+    """
+    for key in ("inertia_kg_m2", "frequency_response"):
+        part = document.get(key)
+        stated = part.get("confidence") if isinstance(part, Mapping) else None
+        if isinstance(stated, int | float) and not isinstance(stated, bool):
+            return float(stated)
+    return None
+
+
 def with_interval(value: float, low: float, high: float, unit: str) -> str:
     """Return ``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width set the decimals."""
     half = 0.5 * (high - low)

@@ -50,6 +50,15 @@ def test_intervals_of_less_than_95_percent_decide_nothing(changed):
     assert judged(wide)["verdict"] == judged(document(**changed))["verdict"] != "cannot tell"
 
 
+def test_the_gains_of_a_run_without_j_need_95_percent_too():
+    """A run that measures the drive's impedance states its coverage with the frequency response only."""
+    found = {"inertia_kg_m2": None, "frequency_response": {"confidence": 0.5},
+             "impedance": {"gain_nm_s_rad": part(300.0, 0.01)}}
+    assert judged(found, {"gain": (300.0, 30.0)})["verdict"] == "cannot tell"
+    found["frequency_response"]["confidence"] = 0.95
+    assert judged(found, {"gain": (300.0, 30.0)})["verdict"] == "pass"
+
+
 @pytest.mark.parametrize(("changed", "name", "words"), [
     ({"inertia": 135.0}, "inertia", "moment of inertia J is 1.3 times"),
     ({"speed_lag": 1.2}, "speed-lag", "lag of the reported speed is 3 times the expected value: the speed filter"),
