@@ -147,11 +147,21 @@ def require_target(flag: str, path: Path, sources: Iterable[Path], source: str) 
     if path.resolve() in [one.resolve() for one in sources]:
         raise UsageError(f"is {source} itself", where=where, next_step="Name another file",
                          entry=MessageCode.SAME_FILE_TWICE)
+    require_new(flag, path)
+
+
+def require_new(flag: str, path: Path) -> None:
+    """Raise UsageError if the file exists already, or its folder does not."""
     if path.exists():
-        raise existing_file(where)
+        raise existing_file(f"{flag} {path}")
+    require_folder(flag, path)
+
+
+def require_folder(flag: str, path: Path) -> None:
+    """Raise UsageError if the folder of a file to be written does not exist."""
     if not path.parent.is_dir():
-        raise UsageError("the folder does not exist", where=where, next_step=f"Make {path.parent} first",
-                         entry=MessageCode.FILE_NOT_WRITABLE)
+        raise UsageError("can't be written: its folder does not exist", where=f"{flag} {path}",
+                         next_step=f"Make {path.parent} first", entry=MessageCode.FILE_NOT_WRITABLE)
 
 
 def add_drive_arguments(parser: argparse.ArgumentParser, *, moves: bool = False) -> argparse._ArgumentGroup:

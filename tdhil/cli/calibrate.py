@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from profiles.quantities import INERTIA
-from tdhil.cli.arguments import add_option, amount, require_inertia, share
-from tdhil.cli.calibrate_reference import WITHOUT_BODY, require_new, run_without_body
+from tdhil.cli.arguments import add_option, amount, require_inertia, require_new, share
+from tdhil.cli.calibrate_reference import WITHOUT_BODY, run_without_body
 from tdhil.cli.calibrate_speed import add_speed_arguments
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
@@ -96,7 +96,8 @@ def run_torque(namespace: argparse.Namespace) -> int:
             raise UsageError("needs the torque of a sensor: --reference, or --pairs",
                              where=f"--{name.replace('_', '-')}")
     wanted = _wanted(namespace)
-    require_new(namespace.save)
+    if namespace.save is not None:
+        require_new("--save", namespace.save)
     report = ReportFile.of_files(namespace, *(path for path, _, _ in wanted))
     runs = _read(namespace, wanted)
     from tdhil.report import PlainConsole, calibration_report, print_calibration, stderr_console, working

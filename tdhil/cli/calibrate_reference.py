@@ -7,13 +7,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from datetime import datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tdhil.cli.arguments import require_new
 from tdhil.cli.replay import read_recorded
 from tdhil.cli.report_file import ReportFile
 from tdhil.cli.results import print_json
-from tdhil.errors import ExitCode, MessageCode, UsageError, existing_file
+from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -47,7 +47,8 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
     if kind == "known_pipe" and namespace.at == "main":
         raise UsageError("does not go with --known-pipe, whose file states the shaft", where="--at main",
                          next_step=f"Such as: {_EXAMPLES[kind]}")
-    require_new(namespace.save)
+    if namespace.save is not None:
+        require_new("--save", namespace.save)
     report = ReportFile.of_files(namespace, getattr(namespace, kind), *namespace.logs)
     document, record = _KINDS[kind](namespace, confidence)
     console = stderr_console()
@@ -65,20 +66,6 @@ def run_without_body(namespace: argparse.Namespace, confidence: float) -> int:
     if report is not None:
         report.write(factor_report(document), () if record is None else (record.configuration,))
     return int(ExitCode.OK if found else ExitCode.NOT_IDENTIFIABLE)
-
-
-def require_new(path: Path | None) -> None:
-    """Raise UsageError if the file exists already, or its folder does not."""
-    if path is not None and path.exists():
-        raise existing_file(f"--save {path}")
-    require_folder(path)
-
-
-def require_folder(path: Path | None) -> None:
-    """Raise UsageError if the folder of a file to be saved does not exist."""
-    if path is not None and not path.absolute().parent.is_dir():
-        raise UsageError("can't be written: its folder does not exist", where=f"--save {path}",
-                         next_step=f"Make {path.parent} first", entry=MessageCode.FILE_NOT_WRITABLE)
 
 
 def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from profiles.quantities import SPEED, TIME
-from tdhil.cli.arguments import LARGEST_VALUE, add_option, amount, share
-from tdhil.cli.calibrate_reference import require_folder
+from tdhil.cli.arguments import LARGEST_VALUE, add_option, amount, require_folder, share
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
@@ -69,8 +68,8 @@ def run_speed(namespace: argparse.Namespace) -> int:
     )
 
     _check(namespace)
-    require_folder(namespace.save)
     if namespace.save is not None:
+        require_folder("--save", namespace.save)
         check_speed_place(namespace.save)
     report = ReportFile.of_files(namespace, *(() if namespace.log is None else (namespace.log,)))
     record = None

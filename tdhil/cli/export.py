@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.cli.arguments import require_log
-from tdhil.cli.results import whole_or_none
 from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, UsageError, existing_file
+from tdhil.new_file import whole_or_none
 
 if TYPE_CHECKING:
     from drivers import RawFrame

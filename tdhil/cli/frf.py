@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, Final
 from profiles import with_code
 from tdhil.cli.arguments import PICTURES, add_option, add_settings, require_target, settings_in
 from tdhil.cli.replay import add_trace_arguments, check_trace, read_recorded
-from tdhil.cli.results import print_json, whole_or_none
+from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.csv_text import cell_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.new_file import whole_or_none
 from tdhil.session import is_evaluation, is_verification, require_file
 
 if TYPE_CHECKING:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.standard_streams import OutputLost
@@ -41,18 +39,6 @@ def save_report(
         if written != path:
             print(f"tdhil: {path} was created by another program meanwhile", file=sys.stderr)  # noqa: T201
         print(f"report: {written}", file=sys.stderr)  # noqa: T201
-
-
-@contextmanager
-def whole_or_none(target: Path) -> Iterator[None]:
-    """Remove a new file whose writing ends early: a part of it would pass for the whole."""
-    try:
-        yield
-    except FileExistsError:
-        raise                        # an earlier file, which stays
-    except BaseException:
-        target.unlink(missing_ok=True)
-        raise
 
 
 def print_json(document: Mapping[str, Any]) -> None:

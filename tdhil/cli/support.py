@@ -17,9 +17,9 @@ from typing import Any
 
 from tdhil.buses import all_buses
 from tdhil.cli.arguments import require_log
-from tdhil.cli.results import whole_or_none
 from tdhil.errors import ExitCode, LogError, MessageCode, UsageError, existing_file
 from tdhil.evidence import Scrub
+from tdhil.new_file import whole_or_none
 from tdhil.version import __version__
 
 LIBRARIES = (

@@ -15,6 +15,7 @@ from tdhil.cli.arguments import add_option, amount, share
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
+    REPORTED_FILTER,
     bounded_estimate,
     calibration_factor,
     check_inner_lags,
@@ -310,7 +311,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
                     namespace.compensate, present, (*found.ends, *of_lags, *of_present), found.inertia_alone_share,
                     required=_required(result, namespace), string_draws=found.draws, inertia_draws=found.inertia_draws,
-                    lag_tolerance=STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE)
+                    lag_tolerance=_lag_tolerance(namespace))
     return case, InputSources(lags_from, present_from)
 
 
@@ -528,7 +529,7 @@ def _lags(
     axes: list[list[float]] = []
     said = "as stated" if namespace.inner_lags else "assumed, not measured"
     if (reported := reported_filter(result)) is not None and not namespace.inner_lags:
-        inner[0], said = reported[0], "the speed filter as the drive reports it; the rest assumed, not measured"
+        inner[0], said = reported[0], REPORTED_FILTER
     if measured is not None and not namespace.inner_lags:
         inner, axes = measured_lags(measured)
         said = "as measured (--impedance)"
@@ -546,12 +547,17 @@ def _lags(
     waiting = 1.5 * float(period) if is_number(period) else 0.0
     low, late, high = ends_of(reported)
     # the drive's own speed filter, the first of the inner lags, is not part of a loop over the bus
-    tolerance = STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE
+    tolerance = _lag_tolerance(namespace)
     rest = [sqrt(sum(axis[k] ** 2 for axis in axes)) if axes else tolerance * inner[k] for k in range(1, len(inner))]
     others = [[0.0, 0.0, *(half if k == at else 0.0 for k in range(len(rest)))] for at, half in enumerate(rest)]
     return _moved_lags(
         [late, waiting, *inner[1:]], [[0.5 * (high - low), 0.0, *(0.0 for _ in inner[1:])], *others],
         f"the reported speed's lag as identified and a cycle and a half; the rest {said}")
+
+
+def _lag_tolerance(namespace: argparse.Namespace) -> float:
+    """Return the relative uncertainty of each lag that was not measured."""
+    return STATED_LAG_TOLERANCE if namespace.inner_lags else ASSUMED_LAG_TOLERANCE
 
 
 def _moved_lags(

@@ -14,6 +14,7 @@ from tdhil.cli.arguments import PICTURES, add_option, amount, require_target
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
 from tdhil.cli.tune_inputs import (
+    REPORTED_FILTER,
     bounded_estimate,
     calibration_factor,
     check_inner_lags,
@@ -188,7 +189,7 @@ def lags_in(
         if reported is not None and not stated:
             filter_s, verified = reported
             lags = (open_by(filter_s, STATED_TOLERANCE if verified else ASSUMED_TOLERANCE), *lags[1:])
-            said = "the speed filter as the drive reports it; the rest assumed, not measured"
+            said = REPORTED_FILTER
     if not any(lag.value for lag in lags) and not dead.value:
         raise UsageError("there is no lag in the drive's loop, so nothing limits its gains", where="--inner-lags",
                          next_step="State the filter of its speed, its torque loop and its sampling",

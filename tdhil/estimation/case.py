@@ -100,10 +100,10 @@ class Finding(ModelResult):
     friction of the model is nonlinear in speed. ``samples_used``: None for the number of the case. ``preface`` and
     ``remark``: text before and after the sentence on the model. ``reading_kg_m2``: additional error of J, on either
     side, due to the moment at which torque is read. ``speed_scale_share``: difference of J, as a share, if the angle of
-    the shaft is right and the reported speed is not. ``advice``: replaces the usual advice. ``contradiction``: evidence
-    in the same run that contradicts J beyond chance; J is then not valid. ``reject_p``: the p-value below which the
-    residuals contradict the model. ``curve``: the model over frequency; ``settled``: lines without residual
-    oscillation; () for the lines of the case.
+    the shaft is right and the reported speed is not; it counts as half of a 95 % interval. ``advice``: replaces the
+    usual advice. ``contradiction``: evidence in the same run that contradicts J beyond chance; J is then not valid.
+    ``reject_p``: the p-value below which the residuals contradict the model. ``curve``: the model over frequency;
+    ``settled``: lines without residual oscillation; () for the lines of the case.
     """
 
     words: ModelWords = _WORDLESS

@@ -20,10 +20,11 @@ def conclude(case: Case, finding: Finding) -> Identification:
     p-value of the residuals, another signal or another route of the run contradicts J. ``not_identifiable``: a route
     refused.
     """
-    inertia = _inertia(case, finding)
+    of_speed, of_torque = finding.speed_scale_share / normal_quantile(0.95), case.recording.torque_scale_rel_sd
+    scale_rel_sd = math.hypot(of_torque, of_speed)
+    inertia = _inertia(case, finding, scale_rel_sd)
     verdict, reason, advice, entry = _judged(case.options, finding, inertia)
     by_scale = verdict is Verdict.VALID and inertia is not None and widened_most_by_scale(inertia)
-    of_speed, of_torque = _speed_scale_rel_sd(finding), case.recording.torque_scale_rel_sd
     calibrate = by_scale and of_speed <= of_torque
     if by_scale:
         advice = _BY_SCALE if calibrate else _BY_SPEED
@@ -41,20 +42,19 @@ def conclude(case: Case, finding: Finding) -> Identification:
         "verdict": verdict, "reason": reason, "advice": advice, "entry": entry, "inertia": inertia,
         "calibration_advised": calibrate,
         "warnings": warnings, "paper": case.paper, "torque_ratios": case.torque_ratios,
-        "torque_scale_rel_sd": math.hypot(of_torque, of_speed),
+        "torque_scale_rel_sd": scale_rel_sd,
         "periods_used": case.periods_used,
         "samples_used": case.samples_used if finding.samples_used is None else finding.samples_used,
     })
 
 
-def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
+def _inertia(case: Case, finding: Finding, scale_rel_sd: float) -> InertiaEstimate | None:
     """Return the inertia with the uncertainty of the scales of torque and speed in quadrature, and the uncertainty of
-    the reading moment added.
+    the reading moment added. ``scale_rel_sd``: relative standard uncertainty of both scales together.
     """
     if finding.inertia is None:
         return None
     conditions = ("torque scale exact", *finding.conditions)
-    scale_rel_sd = math.hypot(case.recording.torque_scale_rel_sd, _speed_scale_rel_sd(finding))
     total = with_total(finding.inertia, scale_rel_sd, case.options.confidence, conditions)
     half = finding.reading_kg_m2
     if half == 0.0:
@@ -66,11 +66,6 @@ def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
         low_total=max(total.low_total - half, 0.0),
         high_total=total.high_total + half,
     )
-
-
-def _speed_scale_rel_sd(finding: Finding) -> float:
-    """Return the relative standard uncertainty of the speed scale: the angle's contradiction is a 95 % interval."""
-    return finding.speed_scale_share / normal_quantile(0.95)
 
 
 def _judged(

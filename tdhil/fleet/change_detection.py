@@ -57,12 +57,8 @@ from statistics import NormalDist, median
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tdhil.recording import FloatArray
-
-IntArray = NDArray[np.intp]
-
+from tdhil.recording import FloatArray, IntArray
 
 ALARM: Final = 0.1
 """Limit for a change: it is reported if the probability of "no change" is below this."""

@@ -17,6 +17,7 @@ from urllib.parse import quote, urlencode
 from drivers import CommunicationLost
 from profiles import message_of
 from tdhil.errors import MessageCode, TdhilError, UsageError, existing_file
+from tdhil.new_file import whole_or_none
 from tdhil.service.limits import API, REPLY_S
 
 _ARCHIVED: Final[dict[bool, dict[str, Any]]] = {False: {}, True: {"archived": "true"}}
@@ -272,18 +273,18 @@ class Client:
         """
         if (target := Path(path)).exists():
             raise existing_file(target)
-        with self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer, \
-                target.open("xb") as file:
-            announced, received, why = answer.headers.get("Content-Length"), 0, "the connection ended early"
+        with (self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer,
+              whole_or_none(target), target.open("xb") as file):
+            announced, received = answer.headers.get("Content-Length"), 0
             try:
                 while piece := answer.read(2**16):
                     received += file.write(piece)
+                if announced not in (None, str(received)):
+                    raise HTTPException("the connection ended early")
             except (OSError, HTTPException) as error:
-                announced, why = "", str(error) or type(error).__name__
-            if announced is not None and announced != str(received):
-                target.unlink()
-                raise CommunicationLost(f"only a part of {name} arrived ({received} bytes): {why}", where=run,
-                                        next_step="Download it again", entry=MessageCode.SERVER_UNREACHABLE)
+                raise CommunicationLost(
+                    f"only a part of {name} arrived ({received} bytes): {str(error) or type(error).__name__}",
+                    where=run, next_step="Download it again", entry=MessageCode.SERVER_UNREACHABLE) from error
         return target
 
     def audit(self, limit: int = 200, *, head: str | None = None) -> dict[str, Any]:

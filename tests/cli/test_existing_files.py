@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tdhil.cli.main import main
-from tdhil.cli.results import whole_or_none
 from tdhil.errors import UsageError
+from tdhil.new_file import whole_or_none
 from tdhil.service.client import Client
 
 ROOT = Path(__file__).parents[2]
