@@ -33,7 +33,7 @@ import control
 import numpy as np
 
 from benchmarks.shares import met
-from tdhil.cli.tune_speed import plant_of
+from tdhil.cli.tune_speed import LoopLags, plant_of
 from tdhil.estimation import identify
 from tdhil.recording.recording import Recording
 from tdhil.report import result_document
@@ -131,7 +131,7 @@ def judged(seed: int, phase_deg: float, gain_db: float) -> dict[str, Any]:
     result = result_document(identify(recording), recording, {}, "")
     row: dict[str, Any] = {"seed": seed, "kind": "two-mass" if compliant else "rigid", "model": result["model"]}
     try:
-        case = SpeedLoopCase(plant_of(result, lags, dead, Path("result")), phase_deg, gain_db)
+        case = SpeedLoopCase(plant_of(result, LoopLags(lags, dead), Path("result")), phase_deg, gain_db)
         gains: PiGains = design_speed_loop(case).tuned.gains
     except LoopTuningRefused as error:
         return row | {"refused": str(error)}

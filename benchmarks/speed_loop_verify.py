@@ -42,7 +42,7 @@ import numpy as np
 from benchmarks.kept_rows import kept_rows
 from benchmarks.shares import met
 from benchmarks.speed_loop_margins import MOST_REFUSED, drawn_rig, stated
-from tdhil.cli.tune_speed import plant_of
+from tdhil.cli.tune_speed import LoopLags, plant_of
 from tdhil.estimation import identify
 from tdhil.report import LoopTunedFor, loop_document, result_document
 from tdhil.runner.excitation import RigGuess
@@ -144,7 +144,7 @@ def judged(seed: int) -> dict[str, Any]:
     if two_mass and result.get("inertia_kg_m2") is None:
         return row | {"refused": f"identify: {result.get('reason') or result['error']['message']}"}
     try:
-        case = SpeedLoopCase(plant_of(result, lags, dead, Path("result")))
+        case = SpeedLoopCase(plant_of(result, LoopLags(lags, dead), Path("result")))
         design = design_speed_loop(case)
         if two_mass:
             excited_hz = max(float(line["hertz"]) for line in result["lines"])

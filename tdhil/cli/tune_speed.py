@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
 from tdhil.cli.arguments import PICTURES, add_option, amount, require_target
@@ -42,14 +42,22 @@ if TYPE_CHECKING:
     from tdhil.report import LoopTunedFor
     from tdhil.speed_loop import LoopDesign, MeasuredShaft, Range, UncertainPlant
 
-    Lags = tuple[tuple[Range, ...], Range, str]
-
 ASSUMED_LAGS_S = (0.020, 0.010)
 """Speed filter and torque loop of an inverter in vector control, s: typical, not measured."""
 ASSUMED_DEAD_TIME_S = 0.003
 """Assumed dead time, s: one and a half control periods of 2 ms."""
 STATED_TOLERANCE, ASSUMED_TOLERANCE = 0.1, 0.5
 """Relative half-width of each lag's interval, for a stated and for an assumed lag."""
+
+
+class LoopLags(NamedTuple):
+    """Lags inside the drive's speed loop."""
+
+    lags_s: tuple[Range, ...]
+    dead_time_s: Range
+    source: str = ""
+    sum_s: Range | None = None
+    """Sum of all, if it is known better than each."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,15 +118,14 @@ def run(namespace: argparse.Namespace) -> int:
     with working("reading the result …"):        # a log is identified again, which takes seconds
         result = in_drive_torque(read_result(namespace.result))
         measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
-    lags, dead_time, lags_from = lags_in(
-        namespace.inner_lags, namespace.dead_time, measured, reported_filter(result))
-    plant = plant_of(result, lags, dead_time, namespace.result)
+    lags = lags_in(namespace.inner_lags, namespace.dead_time, measured, reported_filter(result))
+    plant = plant_of(result, lags, namespace.result)
     present, present_from = present_gains(namespace, measured, result)
     case = SpeedLoopCase(plant, namespace.phase_margin, namespace.gain_margin, namespace.bandwidth, present,
                          not namespace.no_notch)
     design = design_speed_loop(case)
     tuned_for = _tuned_for(result, namespace, design, profile_for(namespace, result))
-    tuned_for = replace(tuned_for, lags_from=lags_from, present_from=present_from)
+    tuned_for = replace(tuned_for, lags_from=lags.source, present_from=present_from)
     document = loop_document(design, shaft_in(result), tuned_for)
     if namespace.json:
         print_json(document)
@@ -157,8 +164,8 @@ def _check(namespace: argparse.Namespace) -> None:
 def lags_in(
     stated: Sequence[float] | None, dead_time_s: float | None, measured: Mapping[str, Any] | None,
     reported: tuple[float, bool] | None = None,
-) -> Lags:
-    """Return the lags of the drive's speed loop, its dead time, and their source. Raises UsageError if all are 0.
+) -> LoopLags:
+    """Return the lags of the drive's speed loop and their source. Raises UsageError if all are 0.
 
     ``reported``: filter of the loop as the drive reports it (`reported_filter`); it replaces an assumed one.
     """
@@ -168,17 +175,12 @@ def lags_in(
         return Range(value, value * (1.0 - tolerance), value * (1.0 + tolerance))
 
     if measured is not None:
-        # the sum of speed filter and torque lag is more certain than each, and determines the margins
-        ends = [ends_of(measured[key]) for key in ("speed_filter_s", "torque_lag_s")]
-        shares = [1.0, 1.0]
-        if isinstance(measured.get("inner_lag_s"), dict):
-            low, value, high = ends_of(measured["inner_lag_s"])
-            below, above = (sum(abs(one[end] - one[1]) for one in ends) for end in (0, 2))
-            shares = [min(1.0, (value - low) / below) if below else 1.0,
-                      min(1.0, (high - value) / above) if above else 1.0]
-        lags = tuple(Range(value, value - shares[0] * (value - low), value + shares[1] * (high - value))
-                     for low, value, high in ends)
-        dead, said = Range(0.0, 0.0, 0.0), "as measured (--impedance)"
+        # --impedance measures the sum better than its parts, and models all of it as first-order lags: a part of it may
+        # be dead time
+        together = _range_or_none(measured.get("inner_lag_s"))
+        dead = Range(0.0, 0.0, 0.0 if together is None else ASSUMED_DEAD_TIME_S * (1.0 + ASSUMED_TOLERANCE))
+        found = LoopLags(tuple(_range(ends_of(measured[key])) for key in ("speed_filter_s", "torque_lag_s")), dead,
+                         "as measured (--impedance)", together)
     else:
         lags = tuple(open_by(lag, STATED_TOLERANCE) for lag in stated or ()) or tuple(
             open_by(lag, ASSUMED_TOLERANCE) for lag in ASSUMED_LAGS_S)
@@ -190,14 +192,15 @@ def lags_in(
             filter_s, verified = reported
             lags = (open_by(filter_s, STATED_TOLERANCE if verified else ASSUMED_TOLERANCE), *lags[1:])
             said = REPORTED_FILTER
-    if not any(lag.value for lag in lags) and not dead.value:
+        found = LoopLags(lags, dead, said)
+    if not any(lag.value for lag in found.lags_s) and not dead.value:
         raise UsageError("there is no lag in the drive's loop, so nothing limits its gains", where="--inner-lags",
                          next_step="State the filter of its speed, its torque loop and its sampling",
                          entry=MessageCode.LAGS_MISSING)
-    return lags, dead, said
+    return found
 
 
-def plant_of(result: Mapping[str, Any], lags: tuple[Range, ...], dead_time: Range, path: Path) -> UncertainPlant:
+def plant_of(result: Mapping[str, Any], lags: LoopLags, path: Path) -> UncertainPlant:
     """Return the loop as known from the result, at the motor shaft. Raises LoopTuningRefused without J of
     the motor alone.
     """
@@ -208,14 +211,15 @@ def plant_of(result: Mapping[str, Any], lags: tuple[Range, ...], dead_time: Rang
     damping = _range_or_none(result.get("viscous_nm_s_rad")) or Range(0.0, 0.0, 0.0)
     shaft = result.get("compliant")
     if not isinstance(shaft, dict):
-        return UncertainPlant(Range(value, low, high), damping, lags, dead_time)
+        return UncertainPlant(Range(value, low, high), damping, lags.lags_s, lags.dead_time_s, lag_sum_s=lags.sum_s)
     swings = [bounded_estimate(shaft.get(key)) for key in ("antiresonance_hz", "resonance_hz")]
     if swings[0] is None or swings[1] is None:
         raise LoopTuningRefused("the shaft is compliant, but its antiresonance or resonance is open", where=str(path),
                                 next_step="Identify again with excited frequencies on both sides of the resonance",
                                 entry=MessageCode.NO_INERTIA_TO_TUNE)
-    return UncertainPlant(Range(value, low, high), damping, lags, dead_time, _range(swings[0]), _range(swings[1]),
-                          _range_or_none(shaft.get("damping_nm_s_rad")) or Range(0.0, 0.0, 0.0))
+    return UncertainPlant(
+        Range(value, low, high), damping, lags.lags_s, lags.dead_time_s, _range(swings[0]), _range(swings[1]),
+        _range_or_none(shaft.get("damping_nm_s_rad")) or Range(0.0, 0.0, 0.0), lag_sum_s=lags.sum_s)
 
 
 def _has_value(part: Any) -> bool:

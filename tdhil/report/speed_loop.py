@@ -274,11 +274,7 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     if plant["resonance_hz"] is not None:
         yield "antiresonance", part_with_interval(plant["antiresonance_hz"], "Hz")
         yield "resonance", part_with_interval(plant["resonance_hz"], "Hz")
-    dead = plant["dead_time_s"]
-    lags = " + ".join(f"{1e3 * lag['value']:.3g}" for lag in plant["lags_s"])
-    low, high = (1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high"))
-    yield "lags in the loop", (f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together "
-                               f"{printed_interval(low, high, 3)} ms; {plant['lags_from']}")
+    yield "lags in the loop", f"{_lag_words(plant)}; {plant['lags_from']}"
     if document["tuned_for"]["present_from"] is not None:
         yield "present gains", document["tuned_for"]["present_from"]
     required = document["required"]
@@ -287,6 +283,19 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
         off, hertz = document["measured"]["deviation_rel"], document["measured"]["hertz"]
         yield "measured response", (f"{len(hertz)} lines from {min(hertz):.3g} to {max(hertz):.3g} Hz; without the "
                                     f"lags of the reports, up to {_percent(max(off))} % from this shaft")
+
+
+def _lag_words(plant: Part) -> str:
+    """Return the lags, ms: each with its interval if only their sum is known well."""
+    dead, together = plant["dead_time_s"], plant["lag_sum_s"]
+    lags = " + ".join(f"{1e3 * lag['value']:.3g}" + ("" if together is None else
+                      f" ({printed_interval(1e3 * lag['low'], 1e3 * lag['high'], 3)})") for lag in plant["lags_s"])
+    if together is not None:
+        low, high = 1e3 * together["low"], 1e3 * together["high"]
+        return (f"{lags} ms, together {printed_interval(low, high, 3)} ms, up to {1e3 * dead['high']:.3g} ms of it as "
+                "dead time")
+    low, high = (1e3 * (dead[end] + sum(lag[end] for lag in plant["lags_s"])) for end in ("low", "high"))
+    return f"{lags} ms, dead time {1e3 * dead['value']:.3g} ms; together {printed_interval(low, high, 3)} ms"
 
 
 def _percent(share: float) -> str:

@@ -5,7 +5,8 @@ the integral part costs 14° of phase. P is the only free number: the largest P 
 at all corners, or the P with the requested bandwidth.
 
 **Corners.** J, friction, lags (all together), antiresonance, resonance and the spring's damping, each at both ends of
-its 95 % interval. `benchmarks/speed_loop_margins.py` measures how often the true loop keeps the margins.
+its 95 % interval. If only the sum of two lags is known well, each sum is split in all ways that matter (`_splits`).
+`benchmarks/speed_loop_margins.py` measures how often the true loop keeps the margins.
 
 **Notch.** If the shaft has a resonance, notches of several widths and depths at that frequency are tried. A notch is
 offered if it multiplies the largest bandwidth by `NOTCH_GAIN` or more, or if no gains fit without it.
@@ -13,6 +14,7 @@ offered if it multiplies the largest bandwidth by `NOTCH_GAIN` or more, or if no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from math import inf, isfinite, sqrt
@@ -91,6 +93,8 @@ class UncertainPlant:
     """Antiresonance, Hz. For a rigid shaft, antiresonance, resonance and damping are None."""
     resonance_hz: Range | None = None
     damping_nm_s_rad: Range | None = None
+    lag_sum_s: Range | None = None
+    """Sum of two lags and the dead time, if it is known better than each. None: all lags are at the same end."""
 
     @property
     def believed(self) -> LoopPlant:
@@ -102,10 +106,23 @@ class UncertainPlant:
         return LoopPlant(self.inertia_kg_m2.value, self.viscous_nm_s_rad.value,
                          tuple(lag.value for lag in self.lags_s), self.dead_time_s.value, spring)
 
+    @property
+    def first_lags_s(self) -> tuple[float, float]:
+        """Shortest and longest first lag, s, with the nominal sum; (0, 0) if no sum is stated."""
+        if self.lag_sum_s is None:
+            return 0.0, 0.0
+        first, second = self.lags_s
+        return _first_lags(first, second, self.lag_sum_s.value)
+
     def corners(self) -> tuple[LoopPlant, ...]:
-        """Return the plants at all combinations of interval ends. All lags are at the same end."""
-        lags = ((tuple(lag.low for lag in self.lags_s), self.dead_time_s.low),
-                (tuple(lag.high for lag in self.lags_s), self.dead_time_s.high))
+        """Return the plants at all combinations of interval ends."""
+        lags: Sequence[tuple[tuple[float, ...], float]] = (
+            (tuple(lag.low for lag in self.lags_s), self.dead_time_s.low),
+            (tuple(lag.high for lag in self.lags_s), self.dead_time_s.high))
+        if self.lag_sum_s is not None:
+            first, second = self.lags_s
+            lags = [(pair, dead) for total in self.lag_sum_s.ends for dead in self.dead_time_s.ends
+                    for pair in _splits(first, second, total - dead)]
         springs: list[SpringLoad | None] = [None]
         if self.antiresonance_hz is not None and self.resonance_hz is not None:
             dampings = self.damping_nm_s_rad.ends if self.damping_nm_s_rad else (0.0,)
@@ -114,6 +131,22 @@ class UncertainPlant:
             LoopPlant(inertia, viscous, late, dead, spring)
             for inertia, viscous, (late, dead), spring in product(
                 self.inertia_kg_m2.ends, self.viscous_nm_s_rad.ends, dict.fromkeys(lags), springs))
+
+
+def _first_lags(first: Range, second: Range, sum_s: float) -> tuple[float, float]:
+    """Return the shortest and the longest first lag of two lags with this sum, within their intervals."""
+    return max(first.low, sum_s - second.high), min(first.high, sum_s - second.low)
+
+
+def _splits(first: Range, second: Range, sum_s: float) -> tuple[tuple[float, float], ...]:
+    """Return pairs of lags with this sum: as unequal as their intervals permit, in both directions, and most equal.
+
+    The phase −atan(ω τ₁) − atan(ω τ₂) is greatest for equal lags, which costs gain margin. The gain far above 1/τ is
+    greatest for unequal lags, which matters at a resonance.
+    """
+    sum_s = min(max(sum_s, first.low + second.low), first.high + second.high)
+    least, most = _first_lags(first, second, sum_s)
+    return tuple((one, sum_s - one) for one in dict.fromkeys((least, most, min(max(0.5 * sum_s, least), most))))
 
 
 def _spring(antiresonance_hz: float, resonance_hz: float, damping_nm_s_rad: float) -> SpringLoad:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from math import ceil, exp, pi, sqrt
+from statistics import NormalDist
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -41,6 +42,8 @@ _ROUNDING_HARMONICS = 12
 """Number of harmonics of the rounding error in the model."""
 _ROUNDING_SD, _ROUNDING_MOST = 0.7, 0.98
 """Prior standard deviation, and limit, of the amplitude of the first harmonic, as a share of that without noise."""
+_SPLITS = (0.02, 0.5, 0.98)
+"""First lags of a sum from which to fit, as a share of its range. A fit from one split ends at another minimum."""
 _LEAST_COUPLING, _MOST_LOG = 1e-4, 50.0
 """Least coupling parameter (the shaft is then rigid), and largest ln of P and I as a multiple of the typed value."""
 
@@ -89,7 +92,7 @@ def step_case_of(plain: Mapping[str, Any]) -> StepCase:
     plant = UncertainPlant(
         ranged(said["inertia_kg_m2"]), ranged(said["viscous_nm_s_rad"]), tuple(map(ranged, said["lags_s"])),
         ranged(said["dead_time_s"]), *(None if said.get(name) is None else ranged(said[name]) for name in
-                                       ("antiresonance_hz", "resonance_hz", "damping_nm_s_rad")))
+                                       ("antiresonance_hz", "resonance_hz", "damping_nm_s_rad", "lag_sum_s")))
     law = PiGains(float(gains["gain_nm_s_rad"]), float(gains["integral_nm_rad"]),
                   None if notch is None else NotchFilter(*(float(notch[name]) for name in (
                       "hertz", "numerator_damping", "denominator_damping"))))
@@ -143,14 +146,23 @@ class StepModel:
         self._reference_filter_s = reference_filter_s
         self._delay_s = DELAY_CYCLES * period_s, DELAY_SD_CYCLES * period_s + timing_sd_s
         plant = case.plant
-        lags = (*plant.lags_s, plant.dead_time_s)
+        lags = (*plant.lags_s, plant.dead_time_s) if plant.lag_sum_s is None else (plant.lag_sum_s,)
         total = sum(lag.value for lag in lags)
         self._lags_sd = sum(lag.high - lag.low for lag in lags) / (2.0 * NORMAL_95 * total) if total > 0.0 else 0.0
-        self.size = 11
-        """Parameters: ln P, ln I, J, B, lags of the loop, reporting lag, delay, antiresonance, resonance, damping, and
-        rounding of the report. For a rigid shaft the three of the spring are those of `_coupled`."""
+        least_s, most_s = self._first_s = plant.first_lags_s
+        self.size = 12 if least_s < most_s else 11
+        """Parameters: ln P, ln I, J, B, lags of the loop, reporting lag, delay, antiresonance, resonance, damping,
+        rounding of the report, and the first lag of a sum that is known better than its parts: with a normal parameter,
+        each first lag within the intervals is as probable. For a rigid shaft the three of the spring are those of
+        `_coupled`."""
         self.prior = np.r_[0.0, 0.0, np.ones(self.size - 2)]
         """Prior knowledge of each parameter, 1/variance."""
+        self.starts = (np.zeros(self.size),)
+        """Parameters from which to fit: the nominal plant with the typed gains, then other splits of the sum."""
+        if least_s < most_s:
+            nominal = (plant.lags_s[0].value - least_s) / (most_s - least_s)
+            shares = (min(max(nominal, _SPLITS[0]), _SPLITS[-1]), *_SPLITS)
+            self.starts = tuple(np.r_[np.zeros(11), NormalDist().inv_cdf(share)] for share in shares)
 
     def loop(self, theta: Reals) -> tuple[LoopPlant, PiGains]:
         """Return plant and gains for these parameters."""
@@ -167,8 +179,13 @@ class StepModel:
                 spring, antiresonance_hz=low, resonance_hz=max(_moved(plant.resonance_hz, theta[8]), LEAST_SPLIT * low),
                 damping_nm_s_rad=0.0 if plant.damping_nm_s_rad is None else max(
                     0.0, _shifted(plant.damping_nm_s_rad, theta[9])))
-        found = LoopPlant(inertia, max(0.0, _shifted(plant.viscous_nm_s_rad, theta[3])),
-                          tuple(scale * lag for lag in believed.lags_s), scale * believed.dead_time_s, spring)
+        lags_s = tuple(scale * lag for lag in believed.lags_s)
+        if self.size > 11:
+            least, most = self._first_s
+            first_s = scale * (least + (most - least) * NormalDist().cdf(float(theta[11])))
+            lags_s = first_s, sum(lags_s) - first_s
+        found = LoopPlant(inertia, max(0.0, _shifted(plant.viscous_nm_s_rad, theta[3])), lags_s,
+                          scale * believed.dead_time_s, spring)
         by_p, by_i = (exp(float(one)) for one in np.clip(theta[:2], -_MOST_LOG, _MOST_LOG))
         gains = replace(case.gains, gain_nm_s_rad=case.gains.gain_nm_s_rad * by_p,
                         integral_nm_rad=case.gains.integral_nm_rad * by_i)

@@ -167,7 +167,7 @@ def verify_steps(
     model = StepModel(case, program, period_s, count, timing_sd_s, reference_filter_s)
     mean: Reals = np.asarray(pairs.mean(axis=0), dtype=np.float64) if number else np.zeros(count)
     time_s: Reals = np.asarray(period_s * np.arange(count), dtype=np.float64)
-    start = np.zeros(model.size)
+    start = model.starts[0]
     expected = model.reported(start)
     if number < LEAST_PAIRS:
         return StepVerification(StepOutcome.CANNOT_TELL, f"the log has {number} pairs of steps, and {LEAST_PAIRS} are "
@@ -177,12 +177,12 @@ def verify_steps(
     # The whole response leads near the minimum; its coloured noise decides there. If it led to another minimum, the fit
     # from the prediction is the better one.
     weight = sqrt(number) / max(float(scatter.std()), _LEAST_SD)
-    near, _ = _fitted(model, mean, lambda x: weight * x, start)
+    near = [_fitted(model, mean, lambda x: weight * x, at)[0] for at in model.starts]
 
     def cost(at: Reals) -> float:
         return _cost(model, whiten(mean - model.reported(at)), at)
 
-    theta, slopes = min((_fitted(model, mean, whiten, at) for at in (near, start)), key=lambda fit: cost(fit[0]))
+    theta, slopes = min((_fitted(model, mean, whiten, at) for at in (*near, start)), key=lambda fit: cost(fit[0]))
     prior = np.diag(model.prior)
     inverse = np.linalg.inv(slopes.T @ slopes + prior)
     fitted = model.reported(theta)

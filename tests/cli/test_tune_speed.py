@@ -146,9 +146,13 @@ def test_measured_lags_and_present_gains_come_from_the_impedance(tuned, tmp_path
     code, document, _ = tuned("--impedance", path)
     assert code == 0
     assert document["plant"]["lags_from"] == "as measured (--impedance)"
+    _, text, _ = tuned("--impedance", path, as_json=False)
+    assert ("21 (18 to 24) + 12 (10 to 14) ms, together 32 to 34 ms, up to 4.5 ms of it as dead time"
+            in " ".join(text.split()))
     lags = document["plant"]["lags_s"]
     assert [lag["value"] for lag in lags] == [0.021, 0.012]
-    assert sum(lag["high"] for lag in lags) == pytest.approx(0.034)    # the sum is known to ±1 ms
+    assert document["plant"]["lag_sum_s"] == {"value": 0.033, "low": 0.032, "high": 0.034}
+    assert document["plant"]["dead_time_s"]["high"] == pytest.approx(0.0045)      # a part of the sum
     assert document["controllers"][0]["gain_nm_s_rad"] == pytest.approx(203.0)
     assert tuned("--impedance", path, "--present", 1, 1)[0] == ExitCode.USAGE
 

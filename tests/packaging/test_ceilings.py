@@ -25,7 +25,7 @@ CEILINGS = {
     "tdhil/service": (12_100, "0089"),
     "tdhil/session": (4_500, FIRST),
     "tdhil/soft_torque": (6_100, "0087"),
-    "tdhil/speed_loop": (1_500, FIRST),
+    "tdhil/speed_loop": (1_560, "0090"),
     "tdhil/studies": (6_100, FIRST),
     "drivers": (13_300, "0089"),
     "sim_bus": (12_000, FIRST),
