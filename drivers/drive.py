@@ -11,7 +11,7 @@ that follow, one step a cycle. So every cycle is seen, recorded and guarded alik
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, runtime_checkable
 
@@ -210,6 +210,8 @@ REACTIONS: Final = {
     "coast": "torque off, the shaft coasts", "none": "NONE, the drive does not stop by itself",
 }
 """Reactions of a drive to a silent host, in words, by their names in profiles."""
+BRAKING_REACTIONS: Final = ("quick_stop", "ramp_stop")
+"""Reactions that brake in speed mode."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +223,6 @@ class Preflight:
     modes: frozenset[Mode]
     switch_while_enabled: bool
     quick_stop_in_torque_mode: bool    # quick stop from torque mode decelerates under speed control
-    displays_mode: bool = field(default=True, kw_only=True)    # the drive reports the mode that it is in
     rated_torque_nm: float
     torque_resolution_nm: float
     speed_resolution_rad_s: float
@@ -246,8 +247,14 @@ class Preflight:
 
     @property
     def reaction(self) -> str:
-        """Reaction of the drive to a silent host, in words."""
-        return REACTIONS.get(self.safe_action, self.safe_action)
+        """Reaction of the drive to a silent host, in words.
+
+        The watchdog acts as the drive's own quick stop does. In torque mode only some drives brake.
+        """
+        said = REACTIONS.get(self.safe_action, self.safe_action)
+        unsure = (self.safe_action in BRAKING_REACTIONS and Mode.TORQUE in self.modes and self.switch_while_enabled
+                  and not self.quick_stop_in_torque_mode)
+        return f"{said}; in torque mode the shaft may coast" if unsure else said
 
     @property
     def refused(self) -> tuple[Check, ...]:

@@ -223,11 +223,6 @@ class DriveProfile(DataModel):
         raise NotImplementedError
 
     @property
-    def displays_mode(self) -> bool:
-        """True if the drive reports the mode that it is in; object 6061h of CiA 402 is mandatory."""
-        return True
-
-    @property
     def usual_rate_hz(self) -> float:
         """Cycles per second, unless the run states another rate."""
         raise NotImplementedError

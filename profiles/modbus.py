@@ -442,11 +442,6 @@ class ModbusProfile(DriveProfile):
         return self.modes.torque and self.modes.switch_while_enabled
 
     @property
-    def displays_mode(self) -> bool:
-        """True if a register shows the mode that the drive is in."""
-        return self.modes.display is not None
-
-    @property
     def usual_rate_hz(self) -> float:
         """Cycles per second, unless the run states another rate."""
         return self.cycle.rate_hz

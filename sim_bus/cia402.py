@@ -224,9 +224,7 @@ class Application:
         command, was_on = decode(word), self.energised
         if self._own_stop and command is not DeviceCommand.ENABLE:
             self._own_stop = False
-        coasts = self.mode in {OperationMode.PROFILE_TORQUE,
-                               OperationMode.CYCLIC_TORQUE} and not self.settings.torque_quick_stop
-        if command is DeviceCommand.QUICK_STOP and coasts and self.state is State.ENABLED:
+        if command is DeviceCommand.QUICK_STOP and self._quick_stop_coasts:
             self._enter(State.SWITCH_ON_DISABLED)
         while self._obey(command):
             pass
@@ -266,9 +264,17 @@ class Application:
             self.fault()
         elif option == 2:
             self._obey(DeviceCommand.DISABLE_VOLTAGE)
+        elif option == 3 and self._quick_stop_coasts:
+            self._enter(State.SWITCH_ON_DISABLED)
         elif option == 3 and self._obey(DeviceCommand.QUICK_STOP):
             self._own_stop = self.state is State.QUICK_STOP
         self._weighed = None
+
+    @property
+    def _quick_stop_coasts(self) -> bool:
+        """True if a quick stop, of the host or of the watchdog, removes the torque: in torque mode of some drives."""
+        return (self.mode in {OperationMode.PROFILE_TORQUE, OperationMode.CYCLIC_TORQUE}
+                and not self.settings.torque_quick_stop and self.state is State.ENABLED)
 
     def power_off(self) -> None:
         """Reset the device: no torque, switch on disabled, setpoints cleared."""

@@ -86,7 +86,7 @@ class ForeignTraffic:
             self._link.pump_until(lambda: False, left_s)
         self._link.drain()
         wanted, heard = self.number, self._beats[self.number]
-        if heard:
+        if heard or wanted == self._node:
             free = [n for n in range(HIGHEST_NODE, 0, -1) if n != self._node and not self._beats[n]]
             if not free:
                 raise PreflightRefused(
@@ -95,12 +95,10 @@ class ForeignTraffic:
                     entry=MessageCode.NODE_ID_CONFLICT,
                 )
             self.number = free[0]
-            table.note(
-                "host's node number",
-                f"{self.number}, because another node uses {wanted}: its heartbeat ({0x700 + wanted:03X}h) was received"
-                f" {heard} time{'s' * (heard > 1)}; it would feed the drive's watchdog after a failure of this host",
-                f"{0x700 + wanted:03X}h",
-            )
+            why = f"the drive itself has {wanted}, and would feed its own watchdog" if wanted == self._node else (
+                f"another node uses {wanted}: its heartbeat ({0x700 + wanted:03X}h) was received"
+                f" {heard} time{'s' * (heard > 1)}; it would feed the drive's watchdog after a failure of this host")
+            table.note("host's node number", f"{self.number}, because {why}", f"{0x700 + wanted:03X}h")
         self._armed = True
         return self.number
 

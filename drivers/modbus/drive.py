@@ -249,7 +249,6 @@ class ModbusDrive:
             modes=self._modes,
             switch_while_enabled=profile.modes.switch_while_enabled,
             quick_stop_in_torque_mode=profile.quick_stop.decelerates_in_torque_mode,
-            displays_mode=profile.displays_mode,
             rated_torque_nm=rated_nm,
             torque_resolution_nm=scales.torque,
             speed_resolution_rad_s=scales.speed,

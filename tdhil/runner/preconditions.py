@@ -355,7 +355,7 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
     if wanted == Mode.TORQUE.value and obstacle:
         raise PreflightRefused(
             f"torque mode is requested, but {obstacle}",
-            where="6502h and profile",
+            where="modes and quick_stop of the profile",
             next_step="Use --mode speed",
             entry=MessageCode.NO_TORQUE_MODE,
         )
@@ -447,14 +447,14 @@ def _no_room(what: str, limit: str) -> PreflightRefused:
     )
 
 
-def stops_from_torque_mode(limits: MachineLimits, quick_stop_brakes: bool, displays_mode: bool) -> bool:
+def stops_from_torque_mode(limits: MachineLimits, quick_stop_brakes: bool) -> bool:
     """Return whether a run in torque mode can be stopped above its load.
 
-    ``quick_stop_brakes``: the profile promises that a quick stop brakes in torque mode. Without this promise, a stop
-    above a string needs speed mode, and must see that the drive has entered it. Otherwise the torque may be removed at
-    once, and the string unwinds and drives the shaft.
+    ``quick_stop_brakes``: the profile promises that a quick stop brakes in torque mode. Without this promise, a host
+    can request speed mode before it stops, but the drive's watchdog cannot: it may remove the torque at once. The
+    string then unwinds and drives the shaft.
     """
-    return not limits.has_drill_string or quick_stop_brakes or displays_mode
+    return not limits.has_drill_string or quick_stop_brakes
 
 
 def _torque_obstacle(limits: MachineLimits, preflight: Preflight) -> str:
@@ -463,10 +463,10 @@ def _torque_obstacle(limits: MachineLimits, preflight: Preflight) -> str:
         return "the drive has no torque mode"
     if not preflight.switch_while_enabled:
         return "the drive can't enter torque mode while it turns"
-    if not stops_from_torque_mode(limits, preflight.quick_stop_in_torque_mode, preflight.displays_mode):
+    if not stops_from_torque_mode(limits, preflight.quick_stop_in_torque_mode):
         return (
-            "a stop above a drill string needs speed mode, and this drive does not report its mode: torque could be"
-            " removed at once, and the string would unwind"
+            "if this host fails above a drill string, the drive must brake in torque mode, and its profile does not"
+            " promise that: the torque could be removed at once, and the string would unwind"
         )
     return ""
 

@@ -179,8 +179,7 @@ def _can_torque(profile: Profile, limits: MachineLimits) -> bool:
     """Return whether a run may use torque mode: the rule of `choose_mode`, before the drive is known."""
     from tdhil.runner import stops_from_torque_mode
 
-    return profile.can_torque and stops_from_torque_mode(
-        limits, profile.quick_stop.decelerates_in_torque_mode, profile.displays_mode)
+    return profile.can_torque and stops_from_torque_mode(limits, profile.quick_stop.decelerates_in_torque_mode)
 
 
 def _mode(options: RunOptions, can_torque: bool) -> str:

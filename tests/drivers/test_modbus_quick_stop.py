@@ -74,7 +74,9 @@ def test_it_brakes_to_rest_and_never_lets_go(profile, mode, tmp_path):
 
 
 def test_a_drive_that_stays_in_torque_mode_gets_its_quick_stop_and_a_message(tmp_path):
-    profile = next(one for one in MODBUS if one.name == "siemens/g120")
+    brakes = next(one for one in MODBUS if one.name == "siemens/g120")       # it displays its mode
+    stop = brakes.quick_stop.model_copy(update={"decelerates_in_torque_mode": False})
+    profile = brakes.model_copy(update={"quick_stop": stop})
     left = Left(profile, Mode.TORQUE, tmp_path)
     left.simulated.machine.application.keeps_mode = True
     report = bare_stop(ModbusTarget(left.link, profile, unit=1), left.clock)

@@ -2,13 +2,16 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.other_master import ForeignTraffic
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.preflight import PreflightTable
 from tests.drivers.on_wire import LIMITS, enabled, prepared
 from tests.drivers.scripted_drive import u
 
@@ -55,6 +58,15 @@ def test_a_number_that_another_node_bears_is_not_taken(make, wire, peer, every_s
     (row,) = [check for check in found.checks if check.name == "host's node number"]
     assert "125" in row.found
     assert "127" in row.found
+
+
+def test_the_number_of_the_drive_itself_is_not_taken():
+    """Some drives have node number 127 as delivered. With it, the drive would supervise itself."""
+    link = SimpleNamespace(handlers={}, remote_handlers={}, drain=lambda: None)
+    table = PreflightTable()
+    traffic = ForeignTraffic(link, None, SteppedClock(), node=127, number=127)
+    assert traffic.settle_number(table) == traffic.number == 126
+    assert "the drive itself has 127" in table.checks[0].found
 
 
 def test_the_host_listens_to_the_bus_for_three_seconds(make, wire, peer, fake_time):
