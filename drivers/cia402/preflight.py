@@ -265,7 +265,10 @@ def check_mode_display(table: PreflightTable, objects: Objects, code: int, wait:
     """Write 6060h while the drive is disabled; 6061h must follow."""
 
     def work() -> tuple[str, bool]:
-        objects.change(0x6060, 0, code, 8)
+        if objects.read_if_there(0x6060) is None:      # write-only in some drives: its former value is unknown
+            objects.write(0x6060, 0, code, 8)
+        else:
+            objects.change(0x6060, 0, code, 8)
         shown = objects.read(0x6061, signed=True)
         for _ in range(20):
             if shown == code:

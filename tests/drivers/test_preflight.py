@@ -118,6 +118,17 @@ def test_a_quick_stop_option_that_can_not_be_read_is_named(make, peer, profile):
     assert row.found.startswith("not readable") and "quick stop brakes" in row.next_step
 
 
+@pytest.mark.parametrize("code", [0x06010001, 0x06010000])
+def test_a_mode_that_can_only_be_written(make, peer, code):
+    """CiA 402 permits 6060h as write-only. 6061h confirms the mode, and no former mode is restored."""
+    peer.refuse_read[0x6060, 0] = code
+    drive = make()
+    assert preflight(drive).refused == ()
+    assert [data for index, _, data in peer.writes if index == 0x6060] == [b"\x09", b"\x0a"]
+    assert drive.close() == ()
+    assert [data for index, _, data in peer.writes if index == 0x6060] == [b"\x09", b"\x0a"]
+
+
 def test_preflight_does_not_enable_the_drive(make, peer, wire):
     preflight(make())
     assert peer.machine.state == OFF
