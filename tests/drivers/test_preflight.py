@@ -14,7 +14,7 @@ from tests.drivers.scripted_drive import ScriptedDrive, u
 
 ROWS = [
     "identity", "state", "modes of operation", "rated torque", "angle of the motor", "torque limit", "speed limit",
-    "quick-stop ramp", "quick-stop option", "temperature", "targets", "mode display for 9",
+    "quick-stop ramp", "quick-stop option", "fault reaction", "temperature", "targets", "mode display for 9",
     "mode display for 10", "PDO mapping", "cycle", "interpolation time period", "stepped time",
     "drive's heartbeat", "watchdog reaction", "watchdog",
     "speed loop: gain", "speed loop: integral", "speed loop: filter",
@@ -48,7 +48,7 @@ def test_a_right_drive_passes(make, peer):
     assert found.refused == ()
     assert (found.identity.vendor, found.identity.serial, found.identity.name) == (0x11, 0x44, "scripted")
     notes = {check.name for check in found.checks if check.outcome is Outcome.NOTE}
-    assert notes == {"identity", "angle of the motor", "temperature", *ROWS[-3:]}
+    assert notes == {"identity", "angle of the motor", "fault reaction", "temperature", *ROWS[-3:]}
     assert peer.operational
 
 
@@ -117,6 +117,39 @@ def test_a_quick_stop_option_that_can_not_be_read_is_named(make, peer, profile):
     row = next(one for one in found.checks if one.where == "605Ah")
     assert (row.name, row.outcome, found.refused) == ("quick-stop option", Outcome.NOTE, ())
     assert row.found.startswith("not readable") and "quick stop brakes" in row.next_step
+
+
+@pytest.mark.parametrize(("code", "said", "next_step"), [
+    (0, "shaft coasts", "605Eh to 2"), (1, "slow-down ramp", ""), (2, "quick-stop ramp", ""), (3, "current limit", ""),
+    (4, "voltage limit", ""), (-2, "manufacturer", "manual"), (9, "reserved", "manual"),
+])
+@pytest.mark.parametrize("reaction", ["fault_reaction", "quick_stop"])
+def test_what_the_drive_does_in_a_fault_is_shown(make, peer, profile, code, said, next_step, reaction):
+    """Codes of 605Eh (CiA 402-2). A watchdog that trips into a fault coasts with 0."""
+    peer.objects[0x605E, 0] = u(code, 2)
+    found = preflight(make(changed=changed(profile, "watchdog", reaction=reaction)))
+    (row,) = [check for check in found.checks if check.where == "605Eh"]
+    assert (row.name, row.outcome, found.refused) == ("fault reaction", Outcome.NOTE, ())
+    assert row.found.startswith(f"{code}: ") and said in row.found
+    assert next_step in row.next_step and bool(row.next_step) is bool(next_step)
+    coasts = reaction == "fault_reaction" and code == 0
+    assert found.safe_action == ("coast" if coasts else reaction)
+    assert ("coasts" in found.reaction) is coasts
+    assert not [entry for entry in peer.writes if entry[0] == 0x605E]
+
+
+@pytest.mark.parametrize(("reaction", "rows"), [("fault_reaction", ["not in the drive"]), ("quick_stop", [])])
+def test_a_drive_without_a_fault_reaction_option(make, peer, profile, reaction, rows):
+    del peer.objects[0x605E, 0]
+    found = preflight(make(changed=changed(profile, "watchdog", reaction=reaction)))
+    assert [check.found for check in found.checks if check.where == "605Eh"] == rows
+    assert (found.safe_action, found.refused) == (reaction, ())
+
+
+def test_a_drive_without_a_watchdog_has_no_reaction_in_a_fault(make, peer, profile):
+    peer.objects[0x605E, 0] = u(0, 2)
+    peer.refuse_write[0x1016, 1] = 0x06040043
+    assert preflight(make(changed=changed(profile, "watchdog", reaction="fault_reaction"))).safe_action == "none"
 
 
 @pytest.mark.parametrize("code", [0x06010001, 0x06010000])
@@ -509,7 +542,7 @@ def test_all_errors_at_once(make, peer, profile):
     by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4",
               "interpolation time period": None}           # 4 is a profile mode
     assert rows == [name for row in ROWS if (name := by_row.get(row, row))]
-    good = {"stepped time", "angle of the motor", "temperature", *ROWS[-3:],
+    good = {"stepped time", "angle of the motor", "temperature", "fault reaction", *ROWS[-3:],
             "torque limit"}                                # tighter, so it stays
     assert set(refused(found)) == set(rows) - good
     assert all(check.where for check in found.refused)
