@@ -31,6 +31,10 @@ class ObjectDrive(TimedDrive):
         """Period of a cycle in stepped time, µs."""
         self.store = ObjectStore(node_id, generic_eds())
         self.emergency = Emergency(self.store, self.send_emergency)
+        for sub, kind, text, value in ((1, datatypes.UNSIGNED8, "Interpolation time period", 1),
+                                       (2, datatypes.INTEGER8, "Interpolation time index", -3),
+                                       (0, datatypes.UNSIGNED8, "Entries", 2)):
+            self.store.add(0x60C2, sub, kind, writable=sub > 0, mappable=False, name=text, default=value)
         worn = WornProfile(profile, self.application) if profile is not None else None
         self.setters = ApplicationObjects(self.store, self.application, worn.units if worn else None).setters
         if worn is not None:

@@ -166,6 +166,7 @@ class _Write:
 _REACTIONS = {"none": 0, "fault_reaction": 1, "coast": 2, "quick_stop": 3}
 """Value of 6007h for each reaction."""
 _QUICK_STOP_RAMP = 2
+_CYCLIC_SYNCHRONOUS = {OperationMode.CYCLIC_VELOCITY, OperationMode.CYCLIC_TORQUE}
 
 
 class WornProfile:
@@ -215,6 +216,7 @@ class WornProfile:
             0x6087: torque.slope_rated_s_per_lsb is not None,
             0x60A9: speed.si_unit is not None,
             0x60B2: profile.torque_offset is not None and profile.torque_offset.index == 0x60B2,
+            0x60C2: not _CYCLIC_SYNCHRONOUS.isdisjoint(self._application.modes),
             0x60E0: torque.max_torque_rated_per_lsb is not None,
             0x60E1: torque.max_torque_rated_per_lsb is not None,
         }

@@ -28,6 +28,7 @@ from drivers.canopen.slow_feedback import ModeAndDemand, SlowFeedback
 from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, NodeWatch, SignOfLife
 from drivers.cia402 import (
     DRIVE_SILENT_S,
+    INTERPOLATION,
     Cia402Bus,
     Cia402Drive,
     CycleInputs,
@@ -38,6 +39,7 @@ from drivers.cia402 import (
     Traffic,
     answer_time_s,
     download,
+    set_interpolation,
     upload,
     uploaded,
 )
@@ -158,7 +160,7 @@ class CanopenBus(Cia402Bus):
         life.pace(limits.watchdog_s / 5.0)
         life.host_node = self._foreign_traffic.settle_number(table)
         heard = arming.set_timing(
-            table, self._objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped
+            table, self._objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped, self.interpolates
         )
         self._watchdog_s = limits.watchdog_s
         feed_s = arming.arm_watchdog(
@@ -184,7 +186,7 @@ class CanopenBus(Cia402Bus):
             return ("the drive's watchdog" if self._armed else ""), Group.SAFETY
         if 0x1400 <= index < 0x1600:
             return f"the switch of RPDO{index - 0x1400 + 1}", Group.REST
-        return ("", Group.REST) if index in (0x1006, 0x1017) else None
+        return ("", Group.REST) if index in (0x1006, 0x1017, INTERPOLATION) else None
 
     def start(self) -> None:
         """Start the node, and supervise it."""
@@ -193,7 +195,7 @@ class CanopenBus(Cia402Bus):
         self._watch.start(self._allowed_silence_s)
 
     def set_period(self, period_s: float) -> Sequence[tuple[int, int, bytes]]:
-        """Write 1006h and the transmission type of TPDO2 in pre-operational."""
+        """Write 1006h, 60C2h and the transmission type of TPDO2 in pre-operational."""
         self.period_s = period_s
         changed = []
         self._watch.stop()
@@ -201,6 +203,9 @@ class CanopenBus(Cia402Bus):
         self.take()
         with suppress(ObjectRefused):  # a drive without 1006h follows the SYNC alone
             arming.set_period(self._objects, self._profile, period_s)
+        with suppress(ObjectRefused):
+            if self.interpolates:
+                set_interpolation(self._objects, period_s)
         with suppress(ObjectRefused):
             changed.append((TPDO_COMMUNICATION + 1, 2, arming.set_slow_syncs(self._objects, period_s)))
         self._life.feed()

@@ -12,7 +12,7 @@ from drivers.cia402 import Mapped, Objects, mapping_entry, name, read_entries, w
 from drivers.errors import PreflightRefused
 from profiles import MessageCode
 
-DISABLED = 1 << 31
+DISABLED, NO_REMOTE, EXTENDED = 1 << 31, 1 << 30, 1 << 29
 SLOW_SYNCS, SLOW_S = 5, 0.1
 """Number of SYNCs between two TPDO2 (mode display, torque demand, angle), and longest interval, s. The control loop
 does not need TPDO2 in each cycle, and fewer frames limit the bus load. With a slow cycle TPDO2 comes more often: a lost
@@ -76,7 +76,7 @@ def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
     communication = pdo.communication
     former = read_entries(objects, pdo.mapping), objects.read(communication, 2), objects.read(communication, 1)
     objects.on_restore(lambda: _write(objects, pdo, *former))
-    _write(objects, pdo, wanted, pdo.sync_type, identifier)
+    _write(objects, pdo, wanted, pdo.sync_type, identifier | kept_bits(former[2]))
     found = read_entries(objects, pdo.mapping)
     if found != wanted:
         raise PreflightRefused(
@@ -85,7 +85,6 @@ def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
             next_step="The mapping of this drive may be fixed. Then tdhil can't get torque and speed of one instant",
             entry=MessageCode.PDO_NOT_POSSIBLE,
         )
-    # Bits 11 to 30 are the drive's own (bit 30: no remote frames).
     cob_id, sync_type = objects.read(pdo.communication, 1), objects.read(pdo.communication, 2)
     if cob_id & (DISABLED | 0x7FF) != identifier or sync_type != pdo.sync_type:
         raise PreflightRefused(
@@ -94,6 +93,13 @@ def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
             next_step=f"It must be {identifier:X}h, enabled, and of type {pdo.sync_type} (synchronous)",
             entry=MessageCode.PDO_NOT_POSSIBLE,
         )
+
+
+def kept_bits(cob_id: int) -> int:
+    """Return the drive's own bits of a COB-ID (CiA 301, 1800h): bit 30 (no remote frames), which some drives keep at 1,
+    and bits 11 to 28, which belong to the identifier in an extended frame only (bit 29).
+    """
+    return cob_id & (NO_REMOTE if cob_id & EXTENDED else NO_REMOTE | 0x1FFF_F800)
 
 
 def switch_off_others(objects: Objects, ours: tuple[PdoMapping, ...]) -> dict[int, int]:

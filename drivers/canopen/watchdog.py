@@ -7,7 +7,17 @@ from contextlib import suppress
 
 from drivers.canopen.pdo import FrameShape, Slow, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
-from drivers.cia402 import ANSWER_S, FeedbackSetting, Objects, arm, name, note_period, with_angle
+from drivers.cia402 import (
+    ANSWER_S,
+    INTERPOLATION,
+    FeedbackSetting,
+    Objects,
+    arm,
+    name,
+    note_period,
+    set_interpolation,
+    with_angle,
+)
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.preflight import DIES, PreflightTable
 from profiles import MARKER_INDEX, MessageCode
@@ -88,12 +98,17 @@ def set_slow_syncs(objects: Objects, period_s: float) -> bytes:
 
 
 def set_timing(
-    table: PreflightTable, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
+    table: PreflightTable, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float,
+    stepped: bool, interpolates: bool,
 ) -> bool:
-    """Set cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h. Return whether there is a
-    heartbeat.
+    """Set cycle period 1006h, interpolation time period 60C2h, stepped time of a simulated peer, heartbeat 1017h.
+
+    Return whether there is a heartbeat.
     """
     note_period(table, period_s, "1006h", lambda: set_period(objects, profile, period_s), "SYNC only")
+    if interpolates:
+        note_period(table, period_s, name(INTERPOLATION), lambda: set_interpolation(objects, period_s), "SYNC only",
+                    "interpolation time period")
     if stepped:
         if not profile.cyclic.has_period:
             period_us = round(period_s * 1e6)

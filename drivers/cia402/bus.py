@@ -92,6 +92,8 @@ class Cia402Bus(ABC):
     """Index and sub-index of the object that sets how often the feedback comes; None: nothing can change it."""
     angle_mapped = False
     """True if the cyclic frames carry the motor's angle."""
+    interpolates = False
+    """True if a mode in use is cyclic synchronous: the drive then interpolates between the setpoints (60C2h)."""
 
     def __init__(self, objects: Objects, watch: DriveWatch, clock: Clock, period_s: float) -> None:
         self.objects = objects

@@ -13,18 +13,19 @@ INTERPOLATION = 0x60C2
 
 
 def note_period(
-    table: PreflightTable, period_s: float, where: str, set_period: Callable[[], int], follows: str
+    table: PreflightTable, period_s: float, where: str, set_period: Callable[[], int], follows: str,
+    title: str = "cycle",
 ) -> None:
     """Set the period and add a row. ``set_period`` returns the period read back, µs.
 
-    A drive without the object ``where`` follows what the text ``follows`` names.
+    A drive that lacks or refuses the object ``where`` follows what the text ``follows`` names.
     """
     period_us = round(period_s * 1e6)
     try:
         back = set_period()
-        table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, where)
-    except ObjectRefused:
-        table.note("cycle", f"{period_us} µs; the drive has no {where} and follows {follows}", where)
+        table.row(title, f"{period_us} µs", f"{back} µs", back == period_us, where)
+    except ObjectRefused as error:
+        table.note(title, f"{period_us} µs, not set: {error.what}. The drive follows {follows}", where)
 
 
 def interpolation(period_s: float) -> tuple[int, int]:
@@ -37,9 +38,14 @@ def interpolation(period_s: float) -> tuple[int, int]:
 
 
 def set_interpolation(objects: Objects, period_s: float) -> int:
-    """Write 60C2h. Return the period read back, µs. Raises ObjectRefused."""
+    """Write 60C2h. Return the period read back, µs. Raises ObjectRefused; the period is then the former one."""
     value, exponent = interpolation(period_s)
+    former = objects.read_bytes(INTERPOLATION, 2)
     exponent = objects.change(INTERPOLATION, 2, exponent, 8)
-    value = objects.change(INTERPOLATION, 1, value, 8)
+    try:
+        value = objects.change(INTERPOLATION, 1, value, 8)
+    except ObjectRefused:
+        objects.write_bytes(INTERPOLATION, 2, former)
+        raise
     exponent -= 256 if exponent > 127 else 0
     return round(value * 10.0 ** (exponent + 6))

@@ -25,6 +25,7 @@ from drivers.cia402.limits import QUICK_STOP_OPTION, check_parameters, note_temp
 from drivers.cia402.polling import poll, push
 from drivers.cia402.position import AngleObject, find_angle
 from drivers.cia402.process_data import (
+    CYCLIC_SYNCHRONOUS,
     VL_RELEASED,
     CyclicObjects,
     Units,
@@ -243,6 +244,7 @@ class Cia402Drive:
         check_parameters(table, objects, profile)
         ready.codes = checks.choose_modes(table, objects, profile, limits.torque_offset)
         ready.modes = {code: mode for mode, code in ready.codes.items()}
+        bus.interpolates = not CYCLIC_SYNCHRONOUS.isdisjoint(ready.modes)
         table.checks += scaling.checks
         ready.angle = find_angle(table, objects, profile)
         own = OwnLimits(limits.accept_wider)

@@ -15,7 +15,14 @@ from profiles import Require, with_unit
 from profiles.cia402 import QUICK_STOP_COASTS, Cia402Profile, Parameter
 from profiles.quantities import RAD_S_PER_RPM
 
-QUICK_STOP_OPTION = 0x605A
+QUICK_STOP_OPTION, FAULT_REACTION_OPTION = 0x605A, 0x605E
+FAULT_COASTS = 0
+"""Value of 605Eh with which a fault removes the torque at once (CiA 402-2, 605Eh)."""
+_IN_A_FAULT = {
+    FAULT_COASTS: "a fault removes the torque at once, and the shaft coasts", 1: "a fault brakes on the slow-down ramp",
+    2: "a fault brakes on the quick-stop ramp", 3: "a fault brakes at the current limit",
+    4: "a fault brakes at the voltage limit",
+}
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of the drive that the profile names: read, compared with the required values, and used as scales.
@@ -111,6 +118,7 @@ def set_limits(
         ramp, lsb = limits.quick_stop_rad_s2, ramp_lsb * RAD_S_PER_RPM
         _limit(table, objects, own, QUICK_STOP, "quick-stop ramp", 0x6085, ramp, lsb, 32, "rad/s²", math.ceil)
     _set_quick_stop_option(table, objects, profile.quick_stop.option_code)
+    _note_fault_reaction(table, objects, profile.watchdog.reaction == "fault_reaction")
 
 
 def _set_quick_stop_option(table: PreflightTable, objects: Objects, code: int | None) -> None:
@@ -132,6 +140,28 @@ def _set_quick_stop_option(table: PreflightTable, objects: Objects, code: int | 
         title, f"not {QUICK_STOP_COASTS}", f"{option}: quick stop lets the shaft coast" if coasts else str(option),
         not coasts, where, f"Set {where} to 6 at the drive, so that its quick stop brakes the shaft",
     )
+
+
+def _note_fault_reaction(table: PreflightTable, objects: Objects, trips: bool) -> None:
+    """Add a row of the drive's reaction to a fault, 605Eh, which is not written.
+
+    ``trips``: the drive's watchdog trips into a fault. Then a row states a missing object, too, and the setting must
+    not change during the run.
+    """
+    title, where = "fault reaction", name(FAULT_REACTION_OPTION)
+    try:
+        data = (objects.rely_on("the fault reaction", FAULT_REACTION_OPTION) if trips
+                else objects.read_bytes(FAULT_REACTION_OPTION))
+    except ObjectRefused:
+        if trips:
+            table.note(title, "not in the drive", where, "Check at the drive that a fault brakes the shaft")
+        return
+    option = int.from_bytes(data, "little", signed=True)
+    text = _IN_A_FAULT.get(option, "a reaction of the manufacturer, unknown to tdhil" if option < 0 else "reserved")
+    mend = "" if option in _IN_A_FAULT else "See the drive's manual"
+    if option == FAULT_COASTS:
+        mend = f"Set {where} to 2 at the drive, so that a fault brakes the shaft"
+    table.note(title, f"{option}: {text}", where, mend)
 
 
 def note_temperature(table: PreflightTable, limit_c: float | None) -> None:

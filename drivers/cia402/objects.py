@@ -101,7 +101,11 @@ class Objects(ABC):
             self._changed.add((index, subindex))
 
             def give_back() -> None:
-                self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
+                try:
+                    self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
+                except ObjectRefused:
+                    if self.read_bytes(index, subindex) != before:     # the change may have been refused, too
+                        raise
                 if self.journal is not None:
                     self.journal.given_back(where)
 

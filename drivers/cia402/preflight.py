@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from drivers.cia402.description import text_if_there
-from drivers.cia402.limits import QUICK_STOP_OPTION, DriveSettings
+from drivers.cia402.limits import FAULT_COASTS, FAULT_REACTION_OPTION, QUICK_STOP_OPTION, DriveSettings
 from drivers.cia402.objects import Objects, name, place
 from drivers.cia402.polling import reported_torque
 from drivers.cia402.process_data import (
@@ -265,7 +265,10 @@ def check_mode_display(table: PreflightTable, objects: Objects, code: int, wait:
     """Write 6060h while the drive is disabled; 6061h must follow."""
 
     def work() -> tuple[str, bool]:
-        objects.change(0x6060, 0, code, 8)
+        if objects.read_if_there(0x6060) is None:      # write-only in some drives: its former value is unknown
+            objects.write(0x6060, 0, code, 8)
+        else:
+            objects.change(0x6060, 0, code, 8)
         shown = objects.read(0x6061, signed=True)
         for _ in range(20):
             if shown == code:
@@ -332,6 +335,13 @@ def quick_stop_holds(objects: Objects, profile: Cia402Profile) -> bool | None:
     return None if code is None or code < 0 or code > _LAST_OPTION else code >= _HOLDS_FROM
 
 
+def _safe_action(objects: Objects, profile: Cia402Profile) -> str:
+    """Return the reaction of the drive to a silent host: coast for a fault reaction that removes the torque (605Eh)."""
+    found = objects.relied_on.get((FAULT_REACTION_OPTION, 0))     # there only if the watchdog trips into a fault
+    coasts = found is not None and int.from_bytes(found[1], "little") == FAULT_COASTS
+    return "coast" if coasts else profile.watchdog.reaction
+
+
 class AngleComing(NamedTuple):
     """Resolution of the motor's angle, its period at the cycle in use, and the longest permitted period."""
 
@@ -369,7 +379,7 @@ def report(
         torque_resolution_nm=units.torque_nm_per_lsb,
         speed_resolution_rad_s=units.speed_rad_s_per_lsb,
         watchdog_s=watchdog_s,
-        safe_action=profile.watchdog.reaction if watchdog_s else "none",
+        safe_action=_safe_action(objects, profile) if watchdog_s else "none",
         filters=filters,
         speed_loop=speed_loop,
         torque_setpoint="6071h",

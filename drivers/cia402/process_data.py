@@ -43,6 +43,7 @@ VL_TARGET, VL_ACTUAL = (0x6042, 0, 16), (0x6044, 0, 16)
 MODE_NAMES = {2: "velocity mode", 3: "profile velocity", 4: "profile torque", 9: "cyclic sync velocity",
               10: "cyclic sync torque"}
 """6060h codes that tdhil may use."""
+CYCLIC_SYNCHRONOUS = frozenset({9, 10})
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,11 @@ class Cia402Node(ObjectDrive):
         self.nmt.state = NmtState.PRE_OPERATIONAL
         self._changed_state()
 
+    def refuse_remote_frames(self) -> None:
+        """Let the drive accept only COB-IDs of TPDOs with bit 30 set (no remote frames), as some drives do."""
+        for transmit in self._transmit:
+            transmit.keep_no_remote()
+
     def send_emergency(self, message: bytes) -> None:
         """Send an EMCY."""
         self._send(0x080 + self.id, message)

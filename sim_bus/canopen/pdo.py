@@ -18,6 +18,7 @@ from sim_bus.mapping import LAST_DUMMY, EntryList, MappedData, Setter
 from sim_bus.objects import FORMATS, ObjectStore, key_of
 
 INVALID = 1 << 31
+NO_REMOTE = 1 << 30
 EXTENDED = 1 << 29
 ENTRIES = 8
 """Number of entries of one PDO."""
@@ -156,10 +157,23 @@ class TransmitPdo(Pdo):
         self._syncs = 0
         self._sent = b""
         self._sent_us = 0
+        self._no_remote = False
         communication = 0x1800 + number
         super().__init__(store, communication, 0x1A00 + number, on_change)
         store.hooks[key_of(communication, 3)] = self._set_inhibit
         store.hooks[key_of(communication, 5)] = self._set_event
+
+    def keep_no_remote(self) -> None:
+        """Refuse a COB-ID with bit 30 = 0 from now on, as some drives do; the delivered one has the bit set."""
+        self._no_remote = True
+        delivered = self.store.default(key_of(self._communication, 1))
+        self.store.set_default(self._communication, 1, delivered | NO_REMOTE)
+        self.load()
+
+    def _set_cob_id(self, value: int) -> None:
+        if self._no_remote and not value & NO_REMOTE:
+            raise SdoAbortedError(od.ABORT_VALUE)
+        super()._set_cob_id(value)
 
     def compile(self) -> None:
         self._data = MappedData(self.store, self.mapping.used)

@@ -62,9 +62,6 @@ class Cia402Slave(ObjectDrive):
         short = datatypes.UNSIGNED8
         for index, sub, data_type, writable, name, value in (
             *((0x1C00, sub, short, False, "SyncManager type", sub or 4) for sub in (1, 2, 3, 4, 0)),
-            (0x60C2, 1, short, True, "Interpolation time period", 1),
-            (0x60C2, 2, datatypes.INTEGER8, True, "Interpolation time index", -3),
-            (0x60C2, 0, short, False, "Entries", 2),
             (MARKER_INDEX, 5, datatypes.VISIBLE_STRING, True, "Text for segmented transfers", ""),
         ):
             self.store.add(index, sub, data_type, writable=writable, mappable=False, name=name, default=value)

@@ -69,7 +69,8 @@ class TamperedBus:
 class CanopenBench:
     """CanopenDrive on the embedded simulator, stepped, in this thread."""
 
-    SETTINGS = ((0x1006, 0), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x6072, 0), (0x6080, 0), (0x6085, 0))
+    SETTINGS = ((0x1006, 0), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x6072, 0), (0x6080, 0), (0x6085, 0),
+                (0x60C2, 1), (0x60C2, 2))
     TARGETS = ((0x6060, 0), (0x6071, 0), (0x60FF, 0))
     MAPPING = tuple(
         (index + number, sub)

@@ -42,7 +42,7 @@ class MemoryDrive:
             (0x1000, 0): (402, 4), (0x1018, 1): (1, 4), (0x1018, 2): (2, 4), (0x1018, 3): (3, 4), (0x1018, 4): (4, 4),
             (MARKER_INDEX, MARKER_STAGE): (0, 1), WATCHDOG: (0, 2), (0x6007, 0): (1, 2), (0x603F, 0): (0, 2),
             (0x605A, 0): (2, 2), (0x6072, 0): (1000, 2), (0x6076, 0): (1_000_000, 4), (0x6080, 0): (200, 4),
-            (0x6085, 0): (300, 4), (0x6502, 0): (MODES, 4),
+            (0x6085, 0): (300, 4), (0x6502, 0): (MODES, 4), (0x605E, 0): (2, 2),
         }
         self.data = {key: number.to_bytes(size, "little") for key, (number, size) in numbers.items()}
         self.data |= {(0x1008, 0): b"objects in memory", (MARKER_INDEX, 1): MARKER_TEXT.encode()}

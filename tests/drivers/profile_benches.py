@@ -30,7 +30,7 @@ class Epos4Bench(ProfileBench):
     """Bench with rpm, thousandths of a rated torque in µN·m, no 6074h, and a torque limit by current."""
 
     PROFILE, WORN = "maxon/epos4", True
-    SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0))
+    SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0), (0x60C2, 1))
     MODES = ((9, Mode.SPEED), (10, Mode.TORQUE))
     speed_lsb, torque_lsb = RPM, 1.0
     brakes_in_torque_mode = False  # its quick stop coasts in torque mode: `Preflight.quick_stop_in_torque_mode`

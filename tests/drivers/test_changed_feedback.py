@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from drivers.canopen.pdo_mapping import DISABLED
+from drivers.canopen.pdo_mapping import DISABLED, NO_REMOTE
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost
 from tests.drivers.drive_benches import Run
@@ -58,7 +58,7 @@ REMAPPED = ((0x1800, 1, DISABLED | 0x181), (0x1A00, 0, 0), (0x1A00, 2, 0x6074001
 ])
 def test_a_change_by_the_panel_is_found_within_a_round_and_named(run, writes, where, words):
     if writes[0][1] == 3:
-        writes = ((0x1800, 1, DISABLED | 0x181), *writes, (0x1800, 1, 0x181))
+        writes = ((0x1800, 1, DISABLED | 0x181), *writes, (0x1800, 1, NO_REMOTE | 0x181))
     panel(run, *writes)
     error, took_s = until_lost(run, ROUND_S + 3.0)
     assert where in error.where
@@ -85,7 +85,7 @@ def test_a_whole_remapping_on_the_bus_is_stopped_while_it_is_under_way(run):
     error, took_s = until_lost(run, 1.0)
     assert "1800h:1" in error.where
     assert took_s <= 0.1
-    assert run.bench.read(0x1800, 1) == 0x181
+    assert run.bench.read(0x1800, 1) == NO_REMOTE | 0x181        # as delivered
     assert run.cycle().fresh
 
 

@@ -8,6 +8,7 @@ from drivers.canopen.pdo_mapping import layout, write_pdo
 from drivers.canopen.sdo import SdoObjects
 from drivers.clock import SteppedClock
 from drivers.errors import ObjectRefused, PreflightRefused
+from tests.drivers.drive_benches import Run
 
 
 @pytest.fixture
@@ -29,6 +30,19 @@ def test_the_order_for_the_first_pair(objects, peer):
         ("1800:1", 0x80000181), ("1A00:0", 0), ("1A00:1", 0x60410010), ("1A00:2", 0x60770010), ("1A00:3", 0x606C0020),
         ("1A00:0", 3), ("1800:2", 1), ("1800:1", 0x181),
     ]
+
+
+@pytest.mark.parametrize(("former", "kept"), [
+    (0xC0000181, 0x40000000), (0x40000199, 0x40000000), (0x80000181, 0), (0xC0012981, 0x40012800),
+    (0xFABCD181, 0x40000000),            # a 29-bit identifier: its upper bits are no bits of the drive
+])
+def test_the_drives_own_bits_of_a_cob_id_are_kept(objects, peer, former, kept):
+    """Bit 30 of a TPDO's COB-ID must stay 1 in some drives (CiA 301, 1800h: no remote frames)."""
+    peer.objects[0x1800, 1] = former.to_bytes(4, "little")
+    write_pdo(objects, 1, layout(Slow(demand=True))[1])
+    assert [value for place, value in written(peer) if place == "1800:1"] == [0x80000181 | kept, 0x181 | kept]
+    objects.restore()
+    assert peer.value(0x1800, 1) == former
 
 
 @pytest.mark.parametrize("with_demand", [True, False])
@@ -71,3 +85,16 @@ def test_a_communication_parameter_that_is_not_stored(objects, peer, sub):
     with pytest.raises(PreflightRefused) as caught:
         write_pdo(objects, 1, layout(Slow(demand=True))[1])
     assert "1800h" in caught.value.where
+
+
+def test_a_drive_that_refuses_a_tpdo_with_remote_frames(bench):
+    """Without bit 30 it aborts with 06090030h, as Roboteq's and Lika's drives do."""
+    bench.simulated.simulator.node.refuse_remote_frames()
+    places = ((0x1800, 1), (0x1801, 1))
+    before = bench.settings(places)
+    run = Run(bench)
+    run.ready()
+    assert bench.settings(places) == {"1800h:1": 0x40000181, "1801h:1": 0x40000281}
+    assert run.go(1.0).fresh
+    run.drive.close()
+    assert bench.settings(places) == before

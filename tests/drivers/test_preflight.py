@@ -8,14 +8,15 @@ from drivers.canopen.drive import CanopenDrive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
-from tests.drivers.on_wire import LIMITS
+from tests.drivers.on_wire import LIMITS, cycles
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, REACTION, STOPPING
 from tests.drivers.scripted_drive import ScriptedDrive, u
 
 ROWS = [
     "identity", "state", "modes of operation", "rated torque", "angle of the motor", "torque limit", "speed limit",
-    "quick-stop ramp", "quick-stop option", "temperature", "targets", "mode display for 9", "mode display for 10",
-    "PDO mapping", "cycle", "stepped time", "drive's heartbeat", "watchdog reaction", "watchdog",
+    "quick-stop ramp", "quick-stop option", "fault reaction", "temperature", "targets", "mode display for 9",
+    "mode display for 10", "PDO mapping", "cycle", "interpolation time period", "stepped time",
+    "drive's heartbeat", "watchdog reaction", "watchdog",
     "speed loop: gain", "speed loop: integral", "speed loop: filter",
 ]
 
@@ -47,7 +48,7 @@ def test_a_right_drive_passes(make, peer):
     assert found.refused == ()
     assert (found.identity.vendor, found.identity.serial, found.identity.name) == (0x11, 0x44, "scripted")
     notes = {check.name for check in found.checks if check.outcome is Outcome.NOTE}
-    assert notes == {"identity", "angle of the motor", "temperature", *ROWS[-3:]}
+    assert notes == {"identity", "angle of the motor", "fault reaction", "temperature", *ROWS[-3:]}
     assert peer.operational
 
 
@@ -116,6 +117,92 @@ def test_a_quick_stop_option_that_can_not_be_read_is_named(make, peer, profile):
     row = next(one for one in found.checks if one.where == "605Ah")
     assert (row.name, row.outcome, found.refused) == ("quick-stop option", Outcome.NOTE, ())
     assert row.found.startswith("not readable") and "quick stop brakes" in row.next_step
+
+
+@pytest.mark.parametrize(("code", "said", "next_step"), [
+    (0, "shaft coasts", "605Eh to 2"), (1, "slow-down ramp", ""), (2, "quick-stop ramp", ""), (3, "current limit", ""),
+    (4, "voltage limit", ""), (-2, "manufacturer", "manual"), (9, "reserved", "manual"),
+])
+@pytest.mark.parametrize("reaction", ["fault_reaction", "quick_stop"])
+def test_what_the_drive_does_in_a_fault_is_shown(make, peer, profile, code, said, next_step, reaction):
+    """Codes of 605Eh (CiA 402-2). A watchdog that trips into a fault coasts with 0."""
+    peer.objects[0x605E, 0] = u(code, 2)
+    found = preflight(make(changed=changed(profile, "watchdog", reaction=reaction)))
+    (row,) = [check for check in found.checks if check.where == "605Eh"]
+    assert (row.name, row.outcome, found.refused) == ("fault reaction", Outcome.NOTE, ())
+    assert row.found.startswith(f"{code}: ") and said in row.found
+    assert next_step in row.next_step and bool(row.next_step) is bool(next_step)
+    coasts = reaction == "fault_reaction" and code == 0
+    assert found.safe_action == ("coast" if coasts else reaction)
+    assert ("coasts" in found.reaction) is coasts
+    assert not [entry for entry in peer.writes if entry[0] == 0x605E]
+
+
+@pytest.mark.parametrize(("reaction", "rows"), [("fault_reaction", ["not in the drive"]), ("quick_stop", [])])
+def test_a_drive_without_a_fault_reaction_option(make, peer, profile, reaction, rows):
+    del peer.objects[0x605E, 0]
+    found = preflight(make(changed=changed(profile, "watchdog", reaction=reaction)))
+    assert [check.found for check in found.checks if check.where == "605Eh"] == rows
+    assert (found.safe_action, found.refused) == (reaction, ())
+
+
+def test_a_drive_without_a_watchdog_has_no_reaction_in_a_fault(make, peer, profile):
+    peer.objects[0x605E, 0] = u(0, 2)
+    peer.refuse_write[0x1016, 1] = 0x06040043
+    assert preflight(make(changed=changed(profile, "watchdog", reaction="fault_reaction"))).safe_action == "none"
+
+
+@pytest.mark.parametrize("code", [0x06010001, 0x06010000])
+def test_a_mode_that_can_only_be_written(make, peer, code):
+    """CiA 402 permits 6060h as write-only. 6061h confirms the mode, and no former mode is restored."""
+    peer.refuse_read[0x6060, 0] = code
+    drive = make()
+    assert preflight(drive).refused == ()
+    assert [data for index, _, data in peer.writes if index == 0x6060] == [b"\x09", b"\x0a"]
+    assert drive.close() == ()
+    assert [data for index, _, data in peer.writes if index == 0x6060] == [b"\x09", b"\x0a"]
+
+
+def period(peer):
+    return peer.value(0x60C2, 1), int.from_bytes(peer.objects[0x60C2, 2], "little", signed=True)
+
+
+def test_the_interpolation_time_period_is_set_and_given_back(make, peer, wire):
+    drive = make()
+    assert preflight(drive).refused == ()
+    assert period(peer) == (4, -3)
+    drive.set_rate(800.0)
+    assert period(peer) == (125, -5)
+    drive.set_rate(125.0)
+    assert period(peer) == (8, -3)
+    wire.sent.clear()
+    cycles(drive, wire, 300, Command(Mode.SPEED, 0.0, 0.0))
+    assert not [data for data in wire.of(0x601) if data[1:3] == b"\xc2\x60"]
+    assert drive.close() == ()
+    assert period(peer) == (1, -3)
+
+
+def test_profile_modes_have_no_interpolation_time_period(make, peer):
+    peer.objects[0x6502, 0] = u(1 << 2 | 1 << 3, 4)
+    assert "interpolation time period" not in [check.name for check in preflight(make()).checks]
+    assert period(peer) == (1, -3)
+
+
+@pytest.mark.parametrize(("refused_at", "left"), [
+    ({"refuse_read": (1, 2)}, (1, -3)), ({"refuse_write": (1, 2)}, (1, -3)), ({"refuse_write": (1,)}, (1, -3)),
+])
+def test_a_drive_that_refuses_the_interpolation_time_period_goes_on(make, peer, refused_at, left):
+    """The period stays the former one: not the former value with another exponent."""
+    for how, subs in refused_at.items():
+        getattr(peer, how).update({(0x60C2, sub): 0x06090030 for sub in subs})
+    drive = make(rate_hz=800.0)
+    found = preflight(drive)
+    (row,) = [check for check in found.checks if check.name == "interpolation time period"]
+    assert (found.refused, row.outcome, row.where) == ((), Outcome.NOTE, "60C2h")
+    assert row.found.startswith("1250 µs, not set: ") and "06090030" in row.found
+    assert period(peer) == left
+    assert drive.close() == ()                     # a change that was refused leaves nothing to restore
+    assert period(peer) == left
 
 
 def test_preflight_does_not_enable_the_drive(make, peer, wire):
@@ -277,19 +364,19 @@ def test_rated_torque_from_both(make, peer, rig, good):
 
 LIMIT_OBJECTS = [(0x6072, "torque limit"), (0x6080, "speed limit"), (0x6085, "quick-stop ramp"),
                  (0x605A, "quick-stop option"), (0x1006, "cycle"), (0x1017, "drive's heartbeat"),
-                 (0x6007, "watchdog reaction")]
+                 (0x6007, "watchdog reaction"), (0x60C2, "interpolation time period")]
 
 
 @pytest.mark.parametrize(("index", "row"), LIMIT_OBJECTS)
 def test_acknowledged_but_not_stored(make, peer, index, row):
-    peer.deaf_to.add((index, 0))
+    peer.deaf_to |= {(index, 0), (index, 1)}
     found = preflight(make())
     assert list(refused(found)) == [row]
     assert refused(found)[row].where == f"{index:04X}h"
     assert [check.name for check in found.checks] == ROWS
 
 
-@pytest.mark.parametrize(("index", "row"), [pair for pair in LIMIT_OBJECTS if pair[0] not in (0x1006, 0x1017)])
+@pytest.mark.parametrize(("index", "row"), [pair for pair in LIMIT_OBJECTS if pair[0] not in (0x1006, 0x1017, 0x60C2)])
 def test_refused_by_the_drive(make, peer, index, row):
     peer.refuse_write[index, 0] = 0x06090031
     found = preflight(make())
@@ -452,9 +539,11 @@ def test_all_errors_at_once(make, peer, profile):
     peer.refuse_write |= {(0x1016, 1): 0x06040043, (0x6071, 0): 0x06020000, (0x1600, 0): 0x06010002}
     found = preflight(make(changed=changed(profile, "identity", vendor=0x99)))
     rows = [check.name for check in found.checks]
-    by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4"}
+    by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4",
+              "interpolation time period": None}           # 4 is a profile mode
     assert rows == [name for row in ROWS if (name := by_row.get(row, row))]
-    good = {"stepped time", "angle of the motor", "temperature", "torque limit", *ROWS[-3:]}     # tighter, so it stays
+    good = {"stepped time", "angle of the motor", "temperature", "fault reaction", *ROWS[-3:],
+            "torque limit"}                                # tighter, so it stays
     assert set(refused(found)) == set(rows) - good
     assert all(check.where for check in found.refused)
 

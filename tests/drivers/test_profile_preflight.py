@@ -42,6 +42,17 @@ def test_with_default_settings_it_is_accepted_and_every_limit_is_in_the_drive(ma
     assert "wider, accepted by --accept-wider-limit quick-stop" in ramp.found
 
 
+def test_a_drive_whose_mode_can_only_be_written(make):
+    """CiA 402 permits 6060h as write-only; 6061h confirms each switch, also in motion."""
+    bench = make(CanopenBench)
+    bench.simulated.simulator.node.store.variable(0x6060, 0).access_type = "wo"
+    run = Run(bench)
+    run.turning(2.0, for_s=2.0)
+    run.until(lambda sample: sample.mode is Mode.TORQUE, 1.0, Mode.TORQUE, torque=10.0)
+    run.stop()
+    assert run.drive.close() == ()
+
+
 @pytest.mark.parametrize("unit", [0xFFB44700, 0xFDB44700, 0x00000000])
 def test_another_unit_of_speed_is_refused(make, unit):
     check = refused(found_with(make(Epos4Bench), 0x60A9, 0, unit))["unit of speed"]

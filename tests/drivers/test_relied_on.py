@@ -69,6 +69,17 @@ def test_on_ethercat_too(make):
     assert "the rated torque was changed" in lost(run).what
 
 
+def test_a_fault_reaction_that_the_watchdog_uses(open_bench):
+    run = Run(open_bench(EthercatBench))
+    profile = run.drive._profile
+    watchdog = profile.watchdog.model_copy(update={"reaction": "fault_reaction"})
+    run.drive._profile = profile.model_copy(update={"watchdog": watchdog})
+    assert run.ready().safe_action == "fault_reaction"
+    run.enable()
+    run.bench.slave.drive.data[0x605E, 0] = bytes(2)
+    assert "the fault reaction was changed" in lost(run).what
+
+
 def test_no_further_request_is_sent_for_them(make):
     """The host sends one request every 0.5 s, as without them. Watchdog and quick stop keep their share."""
     run = make(Epos4Bench)

@@ -89,6 +89,17 @@ def test_remapping_rules(bench: Open) -> None:
     assert host.refused(0x1600, 1, 0x00050008, 4) == 0                # a dummy
 
 
+def test_a_drive_that_keeps_bit_30_of_the_cob_ids_of_its_tpdos(bench: Open) -> None:
+    simulated, host = bench()
+    before = host.read(0x1800, 1)
+    simulated.simulator.node.refuse_remote_frames()
+    assert host.read(0x1800, 1) == before | 0x40000000
+    assert host.refused(0x1800, 1, 0x80000181, 4) == 0x06090030
+    assert host.refused(0x1800, 1, 0xC0000181, 4) == 0
+    assert host.refused(0x1801, 1, 0x00000281, 4) == 0x06090030
+    assert host.refused(0x1400, 1, 0x80000201, 4) == 0                # an RPDO has no remote frames
+
+
 def test_marker_switches_the_clock(bench: Open) -> None:
     simulated, host = bench(stepped=False)
     assert host.read(MARKER_INDEX, 2) == 0
