@@ -189,6 +189,10 @@ class MessageCode(Enum):
         62, "A change of scale may not be detected",
         "With this drill string, no cross-check can be compared with J.",
         "Repeat the run, and compare the two results.")
+    CALIBRATION_UNCHECKED = (
+        63, "The torque calibration may belong to another drive",
+        "The drive or the calibration has no serial number, as on Modbus, so tdhil cannot compare the two.",
+        "Compare the nameplate of this drive with that of the calibrated one.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (
