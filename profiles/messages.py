@@ -193,6 +193,10 @@ class MessageCode(Enum):
         63, "The torque calibration may belong to another drive",
         "The drive or the calibration has no serial number, as on Modbus, so tdhil cannot compare the two.",
         "Compare the nameplate of this drive with that of the calibrated one.")
+    FACTOR_UNLIKE_SCALE = (
+        64, "The calibration factor contradicts the stated torque scale",
+        "The factor differs from 1 by more than the uncertainties of the stated scale and of the calibration allow.",
+        "Check the body, the reference or the pipe, and torque_scale_rel_sd in rig.yaml.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from profiles.quantities import printed_bound, printed_share
 from tdhil.estimation import ResidualTest, Verdict
 from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
@@ -145,6 +146,7 @@ class TorqueCalibration:
     slope: float = math.nan
     intercept_kg_m2: float = math.nan
     line_covariance: tuple[tuple[float, ...], ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
@@ -190,16 +192,32 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
             body = printed_bound(least, 3, up=True)
             advice = f"use a body of {body} kg·m² or more at the motor, or measure for longer"
         return replace(refused, reason=reason, advice=advice, least_added_kg_m2=least)
-    # the uncertainty of the factor itself is added to the allowed error
-    most = max(LARGEST_ERROR, LARGEST_IN_SD * case.scale_rel_sd) + student_quantile(case.confidence, CERTAIN) * (
-        factor.standard_uncertainty)
-    if abs(factor.value - 1.0) > most:
-        return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value),
-                       reason=f"the calibration factor would be {factor.value:.3g}: more than {100 * most:.0f} % from "
-                       "1 is no error of a torque scale")
+    impossible, warnings = compared(factor, case.scale_rel_sd, assumed, "the inertia of the body")
+    if impossible:
+        return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value), reason=impossible)
     reason = (f"the runs give κ to {printed_share(factor.half_width_share)} and J to "
               f"{printed_share(inertia.half_width_share)}")
-    return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia)
+    return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia,
+                   warnings=warnings)
+
+
+def compared(
+    factor: MeasuredValue, scale_rel_sd: float, stated: float, reference: str
+) -> tuple[str, tuple[CodedText, ...]]:
+    """Return why κ is no error of a torque scale ('' if it can be one), and a warning if the stated scale excludes it.
+
+    Warning: E_n = |κ − 1|/√(U_stated² + U_κ²) > 1 (ISO/IEC 17043). ``stated``: U_stated; ``reference``: what to check.
+    """
+    error, half = abs(factor.value - 1.0), 0.5 * (factor.high - factor.low)
+    most = max(LARGEST_ERROR, LARGEST_IN_SD * scale_rel_sd) + half
+    if error > most:
+        return (f"the calibration factor would be {factor.value:.3g}: more than {100 * most:.0f} % from 1 is no error"
+                " of a torque scale"), ()
+    if error <= math.hypot(stated, half):
+        return "", ()
+    text = (f"the factor differs from 1 by {100.0 * error:.2g} %, and the stated torque scale allows"
+            f" {printed_share(stated)}. Check {reference}, or the stated scale")
+    return "", (CodedText(text, MessageCode.FACTOR_UNLIKE_SCALE),)
 
 
 def _falls(points: Sequence[FittedPoint]) -> str:

@@ -97,13 +97,14 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:
-        found = replace(calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale), warnings=warnings)
+        found = calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale)
     except ValueError as error:
         raise UsageError(str(error), where=str(namespace.pairs)) from None
     drive = {} if record is None else drive_identity(record.configuration)
     settings = {} if record is None else drive_settings(record.configuration, record.recording)
     document = pairs_document(
-        found, pairs, str(namespace.pairs), drive, settings, confidence=confidence,
+        replace(found, warnings=(*found.warnings, *warnings)), pairs, str(namespace.pairs), drive, settings,
+        confidence=confidence,
         date=datetime.now().astimezone().isoformat(timespec="seconds"),
         simulated=record is not None and record.recording.simulated,
         runs=() if record is None else (log_of_calibration(record),))

@@ -28,6 +28,7 @@ from tdhil.report.calibration_page import (
     shown_degrees,
 )
 from tdhil.report.console import PlainConsole
+from tdhil.report.document import codes_of
 from tdhil.report.intervals import part_with_interval
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
@@ -126,7 +127,8 @@ def known_pipe_document(
             "residual": None if measured is None or measured.residual is None else asdict(measured.residual),
             "inputs": [asdict(one) for one in known.inputs],
         },
-        **_ended(str(source["file"]), runs, drive, settings, date, simulated, ()),
+        **_ended(str(source["file"]), runs, drive, settings, date, simulated,
+                 () if found is None else found.warnings),
         "string": dict(source),
     }
 
@@ -140,7 +142,7 @@ def _ended(
 ) -> dict[str, Any]:
     return {"source": source, "runs": [dict(run) for run in runs], "drive": dict(drive) or None,
             "settings": dict(settings), "date": date, "simulated": simulated, "warnings": list(warnings),
-            "tdhil": __version__}
+            "warning_codes": codes_of(warnings), "tdhil": __version__}
 
 
 def _budget_lines(budget: Sequence[FactorLine]) -> list[dict[str, Any]]:

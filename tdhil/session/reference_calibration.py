@@ -61,7 +61,7 @@ def find_by_reference(
         found, {"file": str(trace), "sha256": digest, "at": at, "rel_sd": rel_sd}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
         date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
-        simulated=recording.simulated, warnings=[*sensor.warnings, *assumed])
+        simulated=recording.simulated, warnings=[*found.warnings, *sensor.warnings, *assumed])
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers import PreflightRefused
-from profiles import CodedText
+from profiles import CodedText, message_of
 from tdhil.errors import MessageCode, UsageError, existing_file
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ KEPT: Final = "torque_calibration"
 """Key of the calibration in the log's configuration."""
 VALID_DAYS: Final = 365.0
 """Validity of a calibration in days, unless rig.yaml states another."""
+_CARRIED = (MessageCode.FACTOR_UNLIKE_SCALE,)
+"""Warnings of a calibration that each result with it repeats."""
 _LARGEST_FILE = 1 << 20
 _AGAIN = "Make one with: tdhil calibrate torque without.mcap with.mcap --added J --save calibration.json"
 
@@ -171,11 +173,17 @@ def _doubts(found: StoredCalibration, drive: Mapping[str, Any], settings: Mappin
             document: Mapping[str, Any]) -> Iterator[CodedText]:
     """Yield the warnings about a calibration that was applied."""
     from tdhil.calibration import OWN_LOG
+    from tdhil.report import text_of
 
     days = document.get("valid_days")
     if old := found.too_old(started, float(days) if isinstance(days, int | float) else VALID_DAYS):
         yield CodedText(f"the torque calibration of {found.day} is {old} (calibration_valid_days); calibrate again",
                         MessageCode.CALIBRATION_WARNING)
+    texts, codes = (part if isinstance(part, list) else [] for part in (
+        document.get("warnings"), document.get("warning_codes")))
+    for text, code in zip(texts, codes, strict=False):
+        if (entry := message_of(str(code))) is not None and entry in _CARRIED:
+            yield CodedText(f"the torque calibration of {found.day} has a warning: {text_of(text)}", entry)
     names = found.settings.get("profile"), settings.get("profile")
     if all(names) and names[0] != names[1]:
         yield CodedText(f"the torque calibration of {found.day} was made with the profile {names[0]}, and this run with"

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from profiles import MessageCode
 from tdhil.calibration import BodyRun, CalibrationCase, calibrate_torque, plan_bodies
 from tdhil.errors import UsageError
 from tdhil.estimation import Verdict, worst_share
@@ -43,6 +44,18 @@ def test_the_difference_of_two_runs_follows_the_closed_formulas():
     assert found.inertia_kg_m2.value == pytest.approx(52.0 * 100.0 / 50.0)
     share = hypot((1.0 + 104.0 / 52.0) * sqrt(2.0) * 0.002, 0.1 / 52.0)
     assert found.inertia_kg_m2.standard_uncertainty == pytest.approx(104.0 * share, rel=1e-9)
+
+
+@pytest.mark.parametrize(("stated", "scale_rel_sd", "warned"), [(62.7, 0.02, True), (62.7, 0.08, False),
+                                                                (56.0, 0.02, False), (50.0, 0.02, True)])
+def test_a_body_that_contradicts_the_stated_torque_scale_gives_a_warning(stated, scale_rel_sd, warned):
+    """The body has 55 kg·m². A factor of 1.14 with a scale of ±4 % was valid without a warning."""
+    found = calibrate_torque(case([104.0, 159.0], [0.0, stated], noise=5e-4, scale_rel_sd=scale_rel_sd))
+    assert found.verdict is Verdict.VALID
+    assert [one.entry for one in found.warnings] == [MessageCode.FACTOR_UNLIKE_SCALE] * warned
+    if stated == 62.7 and warned:
+        assert found.warnings == ("the factor differs from 1 by 14 %, and the stated torque scale allows ±4.0 %."
+                                  " Check the inertia of the body, or the stated scale",)
 
 
 @pytest.mark.heavy

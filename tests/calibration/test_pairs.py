@@ -10,6 +10,7 @@ from tdhil.calibration import MeasuredValue, TorquePairs, calibrate_pairs, line_
 from tdhil.cli import calibrate_reference
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
+from tdhil.report import factor_report
 from tdhil.report.calibration_page import band_of, quantity
 from tdhil.session import RunRecord, read_pairs
 from tests.estimation.reporting import recorded
@@ -139,6 +140,22 @@ def test_the_command_prints_a_card_and_a_document(tmp_path, capsys):
     assert document["calibration_factor"]["value"] == pytest.approx(0.95)
     assert main(["calibrate", "torque", "--pairs", str(path), "--added", "5"]) == 2
     assert main(["calibrate", "torque", "--pairs", str(path), "--save", str(tmp_path / "c.json")]) == 2
+
+
+def test_pairs_that_contradict_the_stated_scale_give_a_warning_with_its_code(tmp_path, capsys):
+    path = tmp_path / "pairs.csv"
+    path.write_text(HEADER + "".join(f"{x},0.1,{0.9 * x},0.1,up\n" for x in (0, 50, 100, 200)))
+    assert main(["calibrate", "torque", "--pairs", str(path)]) == 0
+    card = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert "the factor differs from 1 by 10 %, and the stated torque scale allows ±4.0 %. Check the reference" in card
+    assert "[TDH-064]" in card
+    assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["warning_codes"][0] == "TDH-064"
+    assert any("[TDH-064]" in one for one in factor_report(document).warnings)
+    path.write_text(HEADER + "".join(f"{x},0.1,{0.97 * x},0.1,up\n" for x in (0, 50, 100, 200)))
+    assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
+    assert "TDH-064" not in json.loads(capsys.readouterr().out)["warning_codes"]
 
 
 @pytest.mark.parametrize("many", [8, 80])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from profiles import TdhilError
+from profiles import MessageCode, TdhilError
 from tdhil.calibration import TorqueRecord, calibrate_reference
 from tdhil.cli.main import main
 from tdhil.errors import CsvUnusable
@@ -70,6 +70,11 @@ def test_the_interval_covers(runs):
             continue
         covered.append(found.factor.low <= bench.factor <= found.factor.high)
     assert len(covered) >= 0.95 * runs and np.mean(covered) >= 0.93
+
+
+@pytest.mark.parametrize(("factor", "codes"), [(0.88, [MessageCode.FACTOR_UNLIKE_SCALE]), (0.98, [])])
+def test_a_factor_that_contradicts_the_stated_scale_gives_a_warning(factor, codes):
+    assert [one.entry for one in found_of(SensorBench(factor=factor)).warnings] == codes
 
 
 def shortened(record, keep):

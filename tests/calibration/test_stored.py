@@ -147,6 +147,14 @@ def test_a_drive_that_cannot_be_compared_gives_a_warning(document, drive, profil
     assert [one.entry for one in applied.warnings] == codes
 
 
+def test_a_result_repeats_the_warning_of_its_calibration():
+    document = {**stored(IDENTITY), "warnings": ["the factor differs from 1 by 13 %", "assumed"],
+                "warning_codes": ["TDH-064", "TDH-020"]}
+    _, applied = both(document, IDENTITY, "danfoss/fc302", simulated=False)
+    assert [one.entry for one in applied.warnings] == [MessageCode.FACTOR_UNLIKE_SCALE]
+    assert "has a warning: the factor differs from 1 by 13 %" in applied.warnings[0]
+
+
 @pytest.mark.heavy
 def test_an_old_calibration_is_reported(document):
     old = {**RUN, "started": "2028-01-01T00:00:00+00:00", "torque_calibration": {**document, "valid_days": 100.0}}
