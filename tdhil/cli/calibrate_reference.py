@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.cli.arguments import require_new
@@ -81,7 +80,7 @@ def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:
 def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.calibration import calibrate_pairs, scale_of_reference
     from tdhil.report import pairs_document
-    from tdhil.session import drive_identity, drive_settings, log_of_calibration, read_pairs
+    from tdhil.session import date_of_log, drive_identity, drive_settings, log_of_calibration, read_pairs
 
     if len(namespace.logs) > 1 or (namespace.save is not None and not namespace.logs):
         raise UsageError("takes one log, which names the drive", where="--save" if namespace.save else "--pairs",
@@ -100,15 +99,15 @@ def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
         found = calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale)
     except ValueError as error:
         raise UsageError(str(error), where=str(namespace.pairs)) from None
-    drive = {} if record is None else drive_identity(record.configuration)
-    settings = {} if record is None else drive_settings(record.configuration, record.recording)
-    document = pairs_document(
-        replace(found, warnings=(*found.warnings, *warnings)), pairs, str(namespace.pairs), drive, settings,
-        confidence=confidence,
-        date=datetime.now().astimezone().isoformat(timespec="seconds"),
-        simulated=record is not None and record.recording.simulated,
-        runs=() if record is None else (log_of_calibration(record),))
-    return document, record
+    found = replace(found, warnings=(*found.warnings, *warnings))
+    if record is None:      # no day of the measurement is known: the document is no calibration for rig.yaml
+        return pairs_document(found, pairs, str(namespace.pairs), {}, {}, confidence=confidence, date=None,
+                              simulated=False), None
+    run = log_of_calibration(record)
+    return pairs_document(
+        found, pairs, str(namespace.pairs), drive_identity(record.configuration),
+        drive_settings(record.configuration, record.recording), confidence=confidence, date=date_of_log(run),
+        simulated=record.recording.simulated, runs=(run,)), record
 
 
 def _reference_sd(namespace: argparse.Namespace) -> float | None:

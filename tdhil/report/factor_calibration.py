@@ -46,10 +46,13 @@ PAIRS, REFERENCE, KNOWN_PIPE = "pairs", "reference", "known_pipe"
 
 
 def pairs_document(
-    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
-    simulated: bool, runs: Sequence[Part] = (),
+    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str | None,
+    confidence: float, simulated: bool, runs: Sequence[Part] = (),
 ) -> dict[str, Any]:
-    """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log."""
+    """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log.
+
+    ``date``: of the measurement; None if it is not known.
+    """
     return {
         **_begun(PAIRS, "valid" if not found.refusal else "not_identifiable" if found.too_wide else "model_rejected",
                  found.refusal or (f"{len(pairs.direction)} pairs give κ to "
@@ -138,7 +141,8 @@ def _begun(method: str, verdict: str, reason: str, advice: str) -> dict[str, Any
 
 
 def _ended(
-    source: str, runs: Sequence[Part], drive: Part, settings: Part, date: str, simulated: bool, warnings: Sequence[str]
+    source: str, runs: Sequence[Part], drive: Part, settings: Part, date: str | None, simulated: bool,
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
     return {"source": source, "runs": [dict(run) for run in runs], "drive": dict(drive) or None,
             "settings": dict(settings), "date": date, "simulated": simulated, "warnings": list(warnings),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +23,11 @@ def log_of_calibration(record: RunRecord) -> dict[str, Any]:
     """Return log, name, hash and date of a recording, for the document of a calibration."""
     return {"log": record.log, "name": Path(record.log).name, "sha256": sha256_of(Path(record.log)),
             "date": record.configuration.get("started")}
+
+
+def date_of_log(run: Mapping[str, Any]) -> str:
+    """Return the date of a log, from `log_of_calibration`; the present time for a trace, which has no date."""
+    return str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds"))
 
 
 def find_by_reference(
@@ -60,7 +65,7 @@ def find_by_reference(
     return reference_document(
         found, {"file": str(trace), "sha256": digest, "at": at, "rel_sd": rel_sd}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
-        date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
+        date=date_of_log(run), confidence=confidence,
         simulated=recording.simulated, warnings=[*found.warnings, *sensor.warnings, *assumed])
 
 
@@ -150,7 +155,7 @@ def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict
     return known_pipe_document(
         found, measured, known, refusal, {"file": str(path), "sha256": sha256_of(path)}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
-        date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
+        date=date_of_log(run), confidence=confidence,
         simulated=recording.simulated)
 
 
