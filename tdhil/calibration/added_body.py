@@ -10,6 +10,9 @@ both runs cancels in J. Relative errors x₁ and x₂ of the runs give
 
     dJ/J = (1 + J/b)(x₁ − x₂),        dκ/κ = (y₁ x₁ − y₂ x₂)/(y₂ − y₁),        plus db/b of the body in either.
 
+One balance and one gauge measure all bodies. So the least of their relative uncertainties, such as the assumed 0.2 %,
+is one error δ that all bodies share, dκ/κ = dJ/J = δ for any number of bodies. The rest of a body is its own error.
+
 With more than two runs the line is fitted by generalised least squares with the weights C⁻¹; C is the covariance of the
 runs plus that of the bodies. The residuals test whether the line is straight. Uncertainties are propagated to first
 order (GUM 5.2), degrees of freedom by Welch and Satterthwaite (GUM G.4); coverage intervals are symmetric with
@@ -201,9 +204,7 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
                    warnings=warnings)
 
 
-def compared(
-    factor: MeasuredValue, scale_rel_sd: float, stated: float, reference: str
-) -> tuple[str, tuple[CodedText, ...]]:
+def compared(factor: MeasuredValue, scale_rel_sd: float, stated: float, reference: str) -> tuple[str, tuple[str, ...]]:
     """Return why κ is no error of a torque scale ('' if it can be one), and a warning if the stated scale excludes it.
 
     Warning: E_n = |κ − 1|/√(U_stated² + U_κ²) > 1 (ISO/IEC 17043). ``stated``: U_stated; ``reference``: what to check.
@@ -248,23 +249,33 @@ class _FittedLine:
     by_reported: FloatArray            # ∂beta/∂y, (2, n); the derivative by the bodies is −slope times that
     covariance: FloatArray
     linearity: ResidualTest | None
+    body_errors: dict[str, FloatArray]
+    of_bodies: FloatArray              # their covariance, (n, n), (kg·m²)²
 
 
-_ROUNDS = 10
+_ROUNDS, _ROUNDING = 10, 1e-6
 
 
-def _of_bodies(case: CalibrationCase) -> FloatArray:
-    """Return the covariance of the bodies' inertias, (n, n), (kg·m²)².
+def _body_errors(case: CalibrationCase) -> dict[str, FloatArray]:
+    """Return the independent errors of the bodies by source: the standard uncertainty of each run's body, (n,), kg·m².
 
-    The error of a body does not average out over its runs.
+    The error of a body does not average out over its runs, nor the error that all bodies share over the bodies.
     """
     bodies = [run.body for run in case.runs]
-    return np.array([[one[1] * other[1] if one == other else 0.0 for other in bodies] for one in bodies])
+    added, sd = (np.array(one) for one in zip(*bodies, strict=True))
+    shared = float(np.min(sd[added > 0.0] / added[added > 0.0])) * added
+    own = np.sqrt(np.maximum(sd**2 - shared**2, 0.0)) * (sd > shared * (1.0 + _ROUNDING))
+    errors = [("bodies of " if len({body for body in bodies if body[0] > 0.0}) > 1 else "body of ", "", shared)]
+    errors += [("body of ", ", own error", np.where([one == body for one in bodies], own, 0.0))
+               for body in dict.fromkeys(bodies)]
+    return {what + ", ".join(run.name for run, one in zip(case.runs, sds, strict=True) if one > 0.0) + which: sds
+            for what, which, sds in errors if sds.any()}
 
 
 def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
     design = np.column_stack([np.ones_like(added), added])
-    bodies = _of_bodies(case)
+    errors = _body_errors(case)
+    bodies = sum((np.outer(sd, sd) for sd in errors.values()), np.zeros_like(case.covariance))
     slope = 1.0
     for _ in range(_ROUNDS):
         whole = case.covariance + slope**2 * bodies
@@ -282,7 +293,7 @@ def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
 
         statistic, more = float(left @ np.linalg.solve(whole, left)), float(len(added) - 2)
         linearity = ResidualTest(statistic, more, float(chdtrc(more, statistic)))
-    return _FittedLine(beta, by, covariance, linearity)
+    return _FittedLine(beta, by, covariance, linearity, errors, bodies)
 
 
 def _propagated(
@@ -304,17 +315,14 @@ def _propagated(
     shared = [math.sqrt(max(float(one @ rest @ one), 0.0)) for one in both]
     scale = math.sqrt(max(float(np.trace(rest)) / len(case.runs), 0.0))
     lines.append(CalibrationLine("filters of the reports", scale, "Student", case.degrees_of_freedom, *shared))
-    for body in dict.fromkeys(run.body for run in case.runs):
-        if (sd := body[1]) > 0.0:
-            has = [run.body == body for run in case.runs]
-            names = ", ".join(run.name for run, one in zip(case.runs, has, strict=True) if one)
-            shares = (abs(float(np.sum(one[has]))) * slope * sd for one in both)
-            lines.append(CalibrationLine(f"body of {names}", sd, "normal", CERTAIN, *shares))
+    for source, sds in line.body_errors.items():
+        lines.append(CalibrationLine(source, float(sds.max()), "normal", CERTAIN,
+                                     *(abs(float(one @ sds)) * slope for one in both)))
     reading = case.reading_rel_sd
     if reading > 0.0:
         lines.append(CalibrationLine(
             "moment of reading", reading * float(intercept), "rectangular", CERTAIN, reading, 0.0))
-    found, of_bodies = [], slope**2 * _of_bodies(case)
+    found, of_bodies = [], slope**2 * line.of_bodies
     for value, row, shared_sd in ((factor, both[0], reading), (inertia, both[1], 0.0)):
         runs, bodies = float(row @ case.covariance @ row), float(row @ of_bodies @ row) + shared_sd**2
         variance = runs + bodies

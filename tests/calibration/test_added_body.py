@@ -218,6 +218,27 @@ def test_repeated_mounting_does_not_reduce_the_uncertainty_of_a_body(runs):
     assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
 
 
+@pytest.mark.parametrize("bodies", [2, 5])
+def test_more_bodies_do_not_reduce_the_error_that_they_share(bodies):
+    """One balance and one gauge measure all bodies: 1 % of each is 1 % of κ. It was 0.45 % with five bodies."""
+    added = [0.0, *(55.0 * (k + 1) for k in range(bodies))]
+    found = calibrate_torque(case([104.0 + body for body in added], added, noise=1e-4, sds=[0.01 * b for b in added]))
+    assert found.factor.standard_uncertainty >= 0.01 * found.factor.value
+    (line,) = (line for line in found.budget if line.source.startswith("bodies of run 1, run 2"))
+    assert line.of_factor == pytest.approx(0.01, rel=1e-3)
+    squares = sqrt(sum(line.of_factor**2 for line in found.budget))
+    assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
+
+
+def test_a_body_has_an_own_error_beyond_the_shared_one():
+    found = calibrate_torque(case([104.0, 159.0, 214.0], [0.0, 55.0, 110.0], noise=1e-4, sds=[0.0, 0.11, 1.1]))
+    lines = {line.source: line.standard_uncertainty_kg_m2 for line in found.budget if line.source.startswith("bod")}
+    assert lines == {"bodies of run 1, run 2": pytest.approx(0.22), "body of run 2, own error": pytest.approx(
+        sqrt(1.1**2 - 0.22**2))}
+    squares = sqrt(sum(line.of_inertia**2 for line in found.budget))
+    assert squares * found.inertia_kg_m2.value == pytest.approx(found.inertia_kg_m2.standard_uncertainty, rel=1e-6)
+
+
 def test_a_common_relative_error_is_in_the_factor_and_cancels_in_j():
     """With torque read in step with a speed setpoint, J of each run has the same relative error."""
     plain = calibrate_torque(case([104.0, 159.0], [0.0, 55.0]))
