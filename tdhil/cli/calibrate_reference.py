@@ -80,20 +80,22 @@ def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:
 def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.calibration import calibrate_pairs, scale_of_reference
     from tdhil.report import pairs_document
-    from tdhil.session import date_of_log, drive_identity, drive_settings, log_of_calibration, read_pairs
+    from tdhil.session import date_of_log, drive_identity, drive_settings, gear_before, log_of_calibration, read_pairs
 
     if len(namespace.logs) > 1 or (namespace.save is not None and not namespace.logs):
         raise UsageError("takes one log, which names the drive", where="--save" if namespace.save else "--pairs",
                          next_step=f"Such as: {_EXAMPLES['pairs']}")
     pairs = read_pairs(namespace.pairs)
     record = _one_log(namespace, "pairs") if namespace.logs else None
+    rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     if namespace.at == "main":
         if record is None:
             raise UsageError("needs a log, which has the gear ratio", where="--at main",
                              next_step="Such as: tdhil calibrate torque run.mcap --pairs pairs.csv --at main")
-        ratio = record.recording.gear_ratio
+        ratio, loss = gear_before(record.recording, "main")
+        if len(set(pairs.direction)) < 2:       # with both directions, friction of the gear is in the hysteresis
+            warnings = (*loss, *warnings)
         pairs = replace(pairs, reference_nm=pairs.reference_nm / ratio, reference_sd_nm=pairs.reference_sd_nm / ratio)
-    rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:
         found = calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale)

@@ -22,7 +22,7 @@ KEPT: Final = "torque_calibration"
 """Key of the calibration in the log's configuration."""
 VALID_DAYS: Final = 365.0
 """Validity of a calibration in days, unless rig.yaml states another."""
-_CARRIED = (MessageCode.FACTOR_UNLIKE_SCALE,)
+_CARRIED = (MessageCode.FACTOR_UNLIKE_SCALE, MessageCode.GEAR_LOSS_IN_FACTOR)
 """Warnings of a calibration that each result with it repeats."""
 _LARGEST_FILE = 1 << 20
 _AGAIN = "Make one with: tdhil calibrate torque without.mcap with.mcap --added J --save calibration.json"

@@ -94,7 +94,14 @@ def test_torques_at_the_main_shaft_are_divided_by_the_gear_ratio(tmp_path, capsy
     log = RunRecord(recording, {}, str(log_path))
     monkeypatch.setattr(calibrate_reference, "_one_log", lambda *_: log)
     assert main([*words[:2], str(log_path), *words[2:]]) == 0
-    assert json.loads(capsys.readouterr().out)["calibration_factor"]["value"] == pytest.approx(0.95)
+    document = json.loads(capsys.readouterr().out)
+    assert document["calibration_factor"]["value"] == pytest.approx(0.95)
+    assert "TDH-065" in document["warning_codes"]            # the gear loses torque, and this is in the factor
+    with path.open("a") as file:
+        file.write("".join(f"{x},0.1,{1.1 * 0.95 * x},0.1,down\n" for x in (0, 50, 100, 200)))
+    for at, warned in (("main", False), ("motor", False)):
+        assert main([*words[:2], str(log_path), "--pairs", str(path), "--at", at, "--json"]) == 0
+        assert ("TDH-065" in json.loads(capsys.readouterr().out)["warning_codes"]) is warned
 
 
 def test_the_date_of_the_calibration_is_that_of_the_log(tmp_path, capsys, monkeypatch):

@@ -160,6 +160,15 @@ def files(tmp_path):
             "torque=M:kNm"]
 
 
+@pytest.mark.parametrize(("at", "gear", "warned"), [("main", "2", True), ("main", "1", False), ("motor", "2", False)])
+def test_a_sensor_behind_a_gear_gives_a_warning(files, capsys, at, gear, warned):
+    """A gear with an efficiency of 0.96 gave κ = 0.960 ± 0.006 without a warning."""
+    main(["calibrate", "torque", *files, "--at", at, "--gear", gear, "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert ("TDH-065" in document["warning_codes"]) is warned
+    assert any("the loss of the gear is in the factor" in one for one in document["warnings"]) is warned
+
+
 @pytest.mark.heavy
 def test_the_command_prints_saves_and_reports(files, tmp_path, capsys):
     saved, page = tmp_path / "calibration.json", tmp_path / "page.html"
