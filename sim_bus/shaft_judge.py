@@ -1,8 +1,9 @@
 """Comparison of the true shaft's motion with the run's statements: five rules for a run with wrong reports. Pure.
 
 a  The host never disables a drive whose shaft turns. Exception: there is no string, the shaft accelerates against the
-   quick stop, and the outcome states that the torque was removed.
-b  The shaft turns slower than `TURNING_RAD_S` when it is reported to be at standstill.
+   quick stop or is as slow as in a sign probe, and the outcome states that the torque was removed.
+b  The shaft turns slower than `TURNING_RAD_S` when it is reported to be at standstill, and when its drive is disabled
+   unless by that exception.
 c  An inertia that is `valid` or `valid_wide` has the true one in its total interval. Exception: a scale changed in the
    run by less than the least change that the run states it can show.
 d  The true speed stays below 1.1 times the limit, plus the effect of torque limit and friction in a reaction time.
@@ -25,6 +26,9 @@ from sim_bus.cia402 import DISABLED_BY_HOST
 
 TURNING_RAD_S = 0.2
 """Least speed of a turning shaft, rad/s. A slower one counts as at standstill."""
+
+PROBE_SHARE = 0.1
+"""Speed of a sign probe, as a share of the speed limit: friction stops such a shaft at once."""
 
 SPEED_SHARE = 1.1
 """Multiple of the speed limit that the true speed may always have."""
@@ -183,7 +187,8 @@ def _disabled(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine)
     )
     accelerated = accelerated or speed > shaft.speed_at(at_s - BEFORE_S) + ACCELERATES_RAD_S
     beyond = speed > machine.speed_max_rad_s       # above a string torque is removed only beyond the limit
-    if accelerated and outcome.removed and (beyond or not machine.string):
+    slow = speed <= PROBE_SHARE * machine.speed_max_rad_s and not machine.string
+    if (accelerated or slow) and outcome.removed and (beyond or not machine.string):
         return ""
     return f"disabled at {speed:.2f} rad/s, {at_s:.2f} s" + ", accelerating" * accelerated
 
@@ -191,6 +196,7 @@ def _disabled(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine)
 def _at_rest(shaft: TrueShaft, outcome: ProcessOutcome) -> str:
     if not outcome.at_rest:
         return ""
-    moments = [one for one in (outcome.seen_s, *shaft.disabled_s[-1:]) if one is not None]
+    disabled_s = () if outcome.removed else shaft.disabled_s[-1:]
+    moments = [one for one in (outcome.seen_s, *disabled_s) if one is not None]
     speed = max((shaft.speed_at(at_s) for at_s in moments), default=0.0)
     return f"reported at rest at {speed:.2f} rad/s" if speed > TURNING_RAD_S else ""

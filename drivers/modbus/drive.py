@@ -345,10 +345,11 @@ class ModbusDrive:
         self._unless_frozen(self._ticks.wait)
         if setpoints.speed:
             self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction of the shaft that brakes
-        # After feeding has ended nothing is written, except to disable a shaft at a safe standstill.
-        if self._silent_since_s is not None and not (
-            self._wish is PowerRequest.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
-        ):
+        # After feeding has ended nothing is written, except to disable a shaft at a safe standstill, or to remove the
+        # torque of a shaft that accelerates: the drive's watchdog would brake with the same wrong sign.
+        at_rest = self._at_rest and power_state(self._state) not in _MAY_DRIVE
+        off = self._wish is PowerRequest.OFF and (at_rest or self._removes_torque)
+        if self._silent_since_s is not None and not off:
             return self._watch()
         self._poll_other_masters()
         if self._wish is PowerRequest.ENABLED:

@@ -222,6 +222,7 @@ def _failed(
     said = "the drive was never enabled; nothing has moved"
     if stop is not None and stop.confirmed:
         said = f"the shaft is at standstill (seen at {stop.at_rest_s:.1f} s) and the drive is disabled"
+        said = "; ".join((said, *stop.trouble))
     elif stop is not None:
         loud = not_confirmed(stop)
         console.print(f"tdhil: {loud.coded}", style="bold white on red", markup=False, soft_wrap=True)

@@ -249,7 +249,12 @@ class StopSequence:
     def _sequence(self) -> StopReport:
         self._loop.guard.expected = None
         self._loop.guard.observer.begin_stop(ends_off=self._quick_stop.ends_off)
-        if self._loop.guard.observer.backwards or self._never_moved:
+        backwards = self._loop.guard.observer.backwards
+        if backwards and self._string is None and not self._in_torque_mode and self._remove_torque():
+            self._trouble.append("torque removed: the shaft turned backwards on a forward command, so the drive's speed"
+                                 " control may accelerate it. Friction stops it")
+            return self._coasted(released=True) or self._ended(False, None, True)
+        if (backwards and self._in_torque_mode) or self._never_moved:
             coasted = self._coasted()
             if coasted is not None:
                 return coasted
@@ -493,8 +498,10 @@ class StopSequence:
             at_rest_s = self._see_rest(asked)
         return at_rest_s
 
-    def _coast(self) -> float | None:
+    def _coast(self, released: bool) -> float | None:
         """Command zero torque in torque mode until standstill. Return its control time, s; None if it is not reached.
+
+        ``released``: the torque is removed already, and no mode is requested.
 
         Used if speed control could accelerate the shaft: the sign of a report is inverted, which does not matter for
         standstill, or no motion has ever been reported.
@@ -502,7 +509,7 @@ class StopSequence:
         rest = Standstill(self._loop.guard.observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
         patience = StopTimeout(self._enough_s + rest.settle_s, self._at_rest_rad_s)
         while not patience.over:
-            sample = self._exchange(_NO_TORQUE_ASKED)
+            sample = self._exchange(_REST if released else _NO_TORQUE_ASKED)
             if sample is None:
                 if self._silent >= self._enough_silent:
                     return None
@@ -510,19 +517,19 @@ class StopSequence:
                 continue
             self._ask_position(sample.time_s)
             torque_mode = sample.mode is Mode.TORQUE and sample.state is PowerState.ENABLED
-            if not torque_mode or self._loop.guard.observer.runs_away(sample):
+            if not (released or torque_mode) or self._loop.guard.observer.runs_away(sample):
                 return None
             patience.see(sample.speed_rad_s, self._loop.period_s)
             if rest.see(sample, without_torque=True):
                 return sample.time_s
         return None
 
-    def _coasted(self) -> StopReport | None:
+    def _coasted(self, *, released: bool = False) -> StopReport | None:
         """Coast to standstill, then disable the drive. Return None if the shaft does not coast to standstill."""
-        at_rest_s = self._coast()
+        at_rest_s = self._coast(released)
         if at_rest_s is None:
             return None
-        disabled = self._remove_torque(_NO_TORQUE_ASKED)
+        disabled = released or self._remove_torque(_NO_TORQUE_ASKED)
         stays = disabled and self._stays_at_rest()
         return self._ended(stays, at_rest_s, disabled)
 

@@ -195,6 +195,17 @@ def test_left_to_its_watchdog_the_drive_is_only_read(fed_by, silent_s):
     assert run.cycles(20).state is PowerState.OFF
 
 
+def test_left_to_its_watchdog_the_torque_is_removed_at_any_speed():
+    """The watchdog brakes with the drive's speed control, which may be what accelerates the shaft."""
+    run = Run(changed(GENERIC, watchdog={"fed_by": "control_word", "fed_by_confidence": "verified"}))
+    run.drive.quick_stop()
+    run.bank.feedback = lambda: (1000, 0)
+    run.cycles(3)
+    run.drive.stop_feeding()
+    run.drive.remove_torque()
+    assert run.cycles(5).state is PowerState.OFF
+
+
 def test_a_foreign_change_of_the_mode_does_not_hide_the_words():
     run = Run()
     run.foreign = {MODE: 1, TORQUE_SETPOINT: 100}

@@ -20,8 +20,10 @@ def closed(log):
         return False
 
 
-ONCE_BELIEVED = (746, 856, 2130, 2147, 2264, 3730, 4889, 4980, 5087, 5089)
-"""746: the sensor is lost in the stop above a string. A stiffer release reduced the torque; disabled at 2.4 rad/s.
+ONCE_BELIEVED = (746, 820, 856, 2130, 2147, 2264, 3730, 4734, 4889, 4980, 5087, 5089)
+"""820, 4734: an inverted sensor, and exchanged motor phases, of a drive without torque mode. The sign probe found the
+sign, and the quick stop drove the shaft to 42 rad/s with the full torque.
+746: the sensor is lost in the stop above a string. A stiffer release reduced the torque; disabled at 2.4 rad/s.
 856: a sign changes above a string. It was accepted again while the shaft coasted; speed control drove it to 42 rad/s.
 2130, 2264: a sensor whose scale halves or doubles within stage 2 above a string: J doubled or halved, and valid.
 2147: a sensor whose scale halves in speed mode at low speed: 80 s at twice the speed, 18.8 of 10 rad/s.

@@ -1,5 +1,6 @@
 """Acceleration during a quick stop: evidence of the torque since the stop, point by point."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -62,3 +63,20 @@ def test_a_single_repeated_point_is_no_delay():
     pairs = [pair for _ in range(14) for pair in (*repeated(0.2), (START_RAD_S + 1e-3, PUSHING_NM))]
     assert REPEATED_S > 2.0 * EVERY_S
     assert "accounts for" in by_torque(pairs)
+
+
+@pytest.mark.parametrize(("torque_nm", "found"), [(-LIMITS.torque_nm, True), (-0.5 * LIMITS.torque_nm, False)])
+def test_with_an_unknown_inertia_a_braking_torque_at_its_limit_shows_an_inverted_sign(torque_nm, found):
+    """With exchanged motor phases the quick stop accelerates the shaft, and the report says that it brakes."""
+    unknown = SimpleNamespace(**{**vars(KNOWN), "known": False, "inertia_high": math.inf})
+    runaway, impulse_nms, limit_rad_s = Runaway(LIMITS, STILL_RAD_S), 0.0, LIMITS.speed_max_rad_s
+    runaway.begin(0.5)
+    for k in range(60):
+        impulse_nms += EVERY_S * torque_nm
+        speed = 0.5 + 0.25 * limit_rad_s * EVERY_S * k
+        point = SimpleNamespace(time_s=k * EVERY_S, speed=speed, torque=torque_nm, impulse=impulse_nms,
+                                still=STILL_RAD_S)
+        runaway.see(point, unknown, BELIEF)
+        sample = SimpleNamespace(time_s=k * EVERY_S, speed_rad_s=speed)
+        assert not runaway.seen(BELIEF, sample) or speed > limit_rad_s
+    assert bool(runaway.seen(BELIEF, sample)) is found

@@ -97,7 +97,7 @@ class Observer:
         """Largest torque offset that the stage may command in speed mode, N·m."""
         self.doubt: Contradiction | None = None
         self.backwards = False
-        """Set by a stage in which the shaft turned backwards under a forward torque: the sign of a report is
+        """Set by a stage in which the shaft turned backwards on a forward command: the sign of a report is
         inverted.
         """
         self._gap_s = max(LONGEST_GAP_S, 3.0 * period_s)

@@ -77,6 +77,7 @@ class Runaway:
         self._seen_s: float | None = None
         self._recent: deque[Point] = deque()
         self._inverted = self._brakes = False
+        self._inertia_known = True
 
     def begin(self, speed_rad_s: float) -> None:
         """Note that a quick stop was requested, from this speed."""
@@ -118,6 +119,7 @@ class Runaway:
         self._for_s += point.time_s - before.time_s
         if self._for_s >= PUSHING_S:
             self._slowest_rad_s = min(self._slowest_rad_s, abs(point.speed))
+        self._inertia_known = known.known
         self._see_inverted(point, known)
         took_s = point.time_s - before.time_s
         if point.speed == before.speed and point.torque == before.torque:
@@ -153,7 +155,10 @@ class Runaway:
         self._took_s += took_s
 
     def _see_inverted(self, point: Point, known: ShaftBounds) -> None:
-        """Detect a speed that rises as a reported torque of the opposite sign explains."""
+        """Detect a speed that rises as a reported torque of the opposite sign explains.
+
+        With an unknown J, a braking torque at its limit must have acted all the time: no shaft rises against that.
+        """
         recent = self._recent
         recent.append(point)
         while point.time_s - recent[0].time_s > INVERTED_S:
@@ -162,10 +167,13 @@ class Runaway:
         window_s = point.time_s - start.time_s
         change = abs(point.speed) - abs(start.speed)
         least = FASTER_SHARE * self._limits.speed_max_rad_s
-        if self._limits.has_drill_string or not known.known or window_s < 0.9 * INVERTED_S or change < least:
+        if self._limits.has_drill_string or window_s < 0.9 * INVERTED_S or change < least:
             return
         forward = math.copysign(1.0, point.speed)
         pushed_nms = -forward * (point.impulse - start.impulse)
+        if not known.known:
+            self._inverted = pushed_nms >= AT_LIMIT_SHARE * self._limits.torque_nm * window_s
+            return
         usual_nm = 0.5 * math.fsum(known.friction(point.speed, 0.0))
         expected_nms = pushed_nms - forward * usual_nm * window_s
         least_nms, most_nms = known.inertia_low * change, known.inertia_high * change
@@ -206,8 +214,9 @@ class Runaway:
             if self._angle_above_s >= enough_s:
                 by_position = f"the position moves at {rate:.2f} rad/s"
         by_torque = "" if lighter else self._by_torque(belief.reports_trusted, more)
-        # The speed of a shaft that lost load is used, also if only the sign of the torque is wrong.
-        if lighter and self._inverted and abs(sample.speed_rad_s) > limit:
+        # The speed of a shaft that lost load, or of one before stage 2 has ended, is used, also if only the sign of the
+        # torque is wrong.
+        if (lighter or not self._inertia_known) and self._inverted and abs(sample.speed_rad_s) > limit:
             by_speed = by_speed or f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
             by_torque = "it rises as the reported torque with the opposite sign accounts for"
         ways = [one for one in (by_speed, by_position, by_torque) if one]

@@ -67,7 +67,7 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
             sample = loop.cycle(Command(mode, speed_rad_s, torque_nm))
         except LimitHit as error:
             if recent and sum(recent) < 0.0:
-                loop.guard.observer.backwards = mode is Mode.TORQUE
+                loop.guard.observer.backwards = True
                 raise _wrong_way(sum(recent) / len(recent)) from error
             raise
         recent.append(sample.speed_rad_s)
@@ -75,7 +75,7 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
         travel_rad += sample.speed_rad_s * (sample.time_s - before_s)
         before_s = sample.time_s
         if mean_rad_s < -threshold_rad_s:
-            loop.guard.observer.backwards = mode is Mode.TORQUE
+            loop.guard.observer.backwards = True
             raise _wrong_way(mean_rad_s)
         if mean_rad_s > threshold_rad_s:
             return torque_nm if mode is Mode.TORQUE else None
