@@ -7,12 +7,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.buses import DoctorFinding
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import apis
 from tdhil.service.run_routes import asks_for
-from tdhil.service.run_state import Conflict, NotAllowed, request_wrong
+from tdhil.service.run_state import Conflict, FolderMissing, NotAllowed, request_wrong
 from tdhil.service.schemas import (
     CalibrationBody,
     CalibrationView,
@@ -169,7 +169,10 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
     run, holder, found = await site.at_once(look)          # for each request: a run may have begun since another stop
     if run is not None:
         drive = site.stop_beside(run, holder, who)
-        await site.shared_stop(f"run {run}", partial(site.supervisor.stop, run, who), noted)
+        try:
+            await site.shared_stop(f"run {run}", partial(site.supervisor.stop, run, who), noted)
+        except FolderMissing as error:
+            return StoppedView(which, [run], int(ExitCode.STOP_NOT_CONFIRMED), error.what)
         code, said = (None, "") if drive is None else await drive
         return StoppedView(which, [run], code, said)
     assert found is not None

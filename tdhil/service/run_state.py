@@ -265,6 +265,7 @@ def iso(time_s: float) -> str:
 #     │   └── TooLarge                the uploaded file is larger than the limit                exit 2, HTTP 413
 #     ├── CommunicationLost
 #     │   ├── NotReacting             the run's process is suspended                            exit 5, HTTP 504
+#     │   ├── FolderMissing           the run's folder is missing; its process was signalled    exit 5, HTTP 503
 #     │   └── TooSlow                 an upload takes too long                                  exit 5, HTTP 408
 #     └── PreflightRefused
 #         └── Conflict                another run uses the rig; the code is void                exit 4, HTTP 409
@@ -357,6 +358,12 @@ class NotReacting(CommunicationLost):
     """The run's process is suspended and does not carry out the request."""
 
     entry = MessageCode.RUN_NOT_REACTING
+
+
+class FolderMissing(CommunicationLost):
+    """The run's folder is missing. SIGTERM was sent to its process."""
+
+    entry = MessageCode.SERVER_UNREACHABLE
 
 
 class TooLarge(UsageError):

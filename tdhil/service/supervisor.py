@@ -34,6 +34,7 @@ from tdhil.service.run_state import (
     FULL,
     MAY_TURN,
     Conflict,
+    FolderMissing,
     NoRoom,
     NotReacting,
     NotThere,
@@ -131,6 +132,7 @@ class Supervisor:
         self._live: dict[str, str] = {}                # the rig of each, in the order of their start
         self._console = Console(store, say)
         self._lost: set[str] = set()
+        self._failures: dict[str, str] = {}            # the latest failure of each run's check
         self._stops: dict[str, tuple[str, str]] = {}   # (who, when) requested the stop of a suspended run
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop was not confirmed
         self._unindexed: set[str] = set()
@@ -181,8 +183,13 @@ class Supervisor:
             self._braking = True
         stopping = self.live()
         for run in stopping:
-            with suppress(Exception):
+            try:
                 self.stop(run, who)
+            except (NotReacting, FolderMissing):       # its process was signalled
+                pass
+            except Exception as error:
+                self.say(f"run {run}: the stop failed ({error})")
+                self._terminate(run)
         if stopping:
             self.say(f"Stopping run {', '.join(stopping)}. tdhil waits {within_s:.0f} s at most for standstill."
                      " If a shaft keeps turning, use the hard-wired emergency stop.")
@@ -190,9 +197,11 @@ class Supervisor:
         while self.live() and time.monotonic() < end_s:
             time.sleep(LOOK_S)
         for run in stopping:
-            state = self.store.status(run).state
-            self.say(f"run {run}: {state}")
-            if run in self._live or state is State.STOP_NOT_CONFIRMED:
+            state = None               # unreadable: the shaft may turn
+            with suppress(Exception):
+                state = self.store.status(run).state
+            self.say(f"run {run}: {state or 'its state can not be read'}")
+            if run in self._live or state in (None, State.STOP_NOT_CONFIRMED):
                 self.not_at_rest.append(run)
         return not self.live()
 
@@ -225,12 +234,27 @@ class Supervisor:
         return [one for _, one in sorted(found.items())]
 
     def run_of(self, rig_id: str) -> str | None:
-        """Return the present run of a rig."""
-        for run, rig in tuple(self._live.items()):
-            with suppress(NotThere):
-                if rig == rig_id and not self.store.status(run).ended:
+        """Return the present run of a rig; also one whose folder is missing, while its process runs."""
+        for run in [run for run, rig in tuple(self._live.items()) if rig == rig_id]:
+            try:
+                if not self.store.status(run).ended:
+                    return run
+            except NotThere:
+                if self._running(run) is not None:
                     return run
         return None
+
+    def _running(self, run: str) -> subprocess.Popen[bytes] | None:
+        """Return the process of a run that this service started; None if it has ended."""
+        child = self._children.get(run)
+        return child if child is not None and child.poll() is None else None
+
+    def _terminate(self, run: str) -> bool:
+        """Send SIGTERM to the run's process, which stops the shaft. Return whether it was sent."""
+        if (child := self._running(run)) is None:
+            return False
+        child.terminate()
+        return True
 
     def start_run(
         self, rig_id: str, asked: Mapping[str, Any], who: str, key: str | None = None, address: str = "",
@@ -369,8 +393,22 @@ class Supervisor:
 
         A suspended process (SIGSTOP, a debugger) can't stop the shaft, and must not continue later. It is killed, and
         its drive is stopped as for any run whose process was lost (decision 0022). Raises NotReacting then, NotThere,
-        and CommunicationLost if neither reached the run.
+        CommunicationLost if neither reached the run, and FolderMissing after SIGTERM without the run's folder.
         """
+        rig = self._live.get(run)
+        try:
+            return self._stop(run, who)
+        except NotThere:
+            if not self._terminate(run):
+                raise
+        self.note(who, "stop asked", run, rig, process="without folder")
+        raise FolderMissing(
+            page_text("the folder of the run is missing. SIGTERM was sent to its process, which stops the shaft."
+                      " Standstill can't be shown here"), where=f"run {run}",
+            next_step=page_text("Check that the shaft comes to standstill. If it turns, use the hard-wired emergency"
+                                " stop"))
+
+    def _stop(self, run: str, who: str) -> Status:
         folder = self.store.place(run)
         wish = {"do": "stop", "by": who}
         try:
@@ -413,12 +451,14 @@ class Supervisor:
             next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired emergency stop")
 
     def held_beside(self, run: str) -> Holder | None:
-        """Return the other program that holds the drive of a run whose motion is over. Raises NotThere.
+        """Return the other program that holds the drive of a run whose motion is over; None for a missing run.
 
         Such a run holds no drive itself, so a stop of the run does not reach the shaft.
         """
-        identifying = self.store.status(run).state is State.IDENTIFYING
-        return holder_of(self._address_of(run)) if identifying else None
+        with suppress(NotThere):
+            if self.store.status(run).state is State.IDENTIFYING:
+                return holder_of(self._address_of(run))
+        return None
 
     def stop_beside(self, run: str, holder: Holder, who: str) -> tuple[int, str]:
         """Run `tdhil stop` on the drive of a run that another program holds. Return the exit code and a text."""
@@ -561,14 +601,27 @@ class Supervisor:
                 try:
                     self._look_at(run)
                 except Exception as error:     # the check of one run failed: the others are still supervised
-                    self.say(f"run {run}: {type(error).__name__}: {error}")
+                    failure = f"run {run}: {type(error).__name__}: {error}"
+                    if self._failures.get(run) != failure:
+                        self._failures[run] = failure
+                        self.say(failure)
 
     def _look_at(self, run: str) -> None:
-        folder = self.store.place(run)
-        alive = lives(folder)
-        status = self.store.status(run)
+        try:
+            folder = self.store.place(run)
+            alive = self._running(run) is not None or lives(folder)
+            status = self.store.status(run)
+        except NotThere:
+            child = self._children.get(run)
+            if child is None or (code := child.poll()) is None:
+                raise LogError("its folder is missing, and its process may still run",
+                               next_step="Stop its rig: SIGTERM is sent to the process") from None
+            if run not in self._lost:
+                self._lost.add(run)
+                self._in_background(lambda: self._end_without_folder(run, code))
+            return
         if status.ended:
-            if alive and run in self._children and self._children[run].poll() is None:
+            if self._running(run) is not None:
                 return                         # the run has written its final status, and its process is about to end
             self._settle(run, status)
         elif not alive:
@@ -593,6 +646,20 @@ class Supervisor:
         self._console.forget(run)
         watched = {} if status.watch is None else {"watch": asdict(status.watch)}
         self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code, **watched)
+
+    def _end_without_folder(self, run: str, code: int) -> None:
+        """End a run whose folder is missing. Stop its drive if its process did not confirm standstill."""
+        rig = self._live[run]
+        try:
+            said = f"its folder is missing; its process ended with exit code {code}"
+            if code < 0 or code == ExitCode.STOP_NOT_CONFIRMED:
+                said = f"{said}; {self.stop_drive(self.rig(rig), 'service')[1]}"
+            self.say(f"run {run}: {said}")
+        finally:
+            self._children.pop(run, None)
+            self._live.pop(run, None)
+            self._console.forget(run)
+            self.note("service", "ended: its folder is missing", run, rig, exit_code=code)
 
     def _died(self, run: str, status: Status) -> Status:
         """Handle a run whose process is gone: stop its drive first, then save the status and recover the log."""
