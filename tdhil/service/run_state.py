@@ -34,8 +34,8 @@ class State(StrEnum):
     IDENTIFYING = "identifying"
     DONE = "done"
     REFUSED = "refused"                    # before motion, or by the sign probe or unit check
-    STOPPED = "stopped"                    # stopped on request, standstill confirmed
-    FAILED = "failed"                      # an error, standstill confirmed
+    STOPPED = "stopped"                    # stopped on request, also before motion: see `Stop.confirmed`
+    FAILED = "failed"                      # an error, also before motion: see `Stop.confirmed`
     STOP_NOT_CONFIRMED = "stop_not_confirmed"
     INTERRUPTED = "interrupted"            # the run's process was lost; the error states how the shaft ended
 
@@ -87,6 +87,7 @@ class Stop:
     """Progress of a stop: each time as ISO 8601 in UTC, None until it is reached.
 
     ``seen``: time at which the drive was in quick stop, or was commanded to zero speed.
+    ``confirmed``: whether standstill was confirmed; None if tdhil did not stop the drive.
     """
 
     asked: str | None = None

@@ -10,9 +10,16 @@
   const STATES = {
     requested: tr("requested"), preflight: tr("preflight"), awaiting_confirmation: tr("waiting for the code"),
     moving: tr("moving"), stopping: tr("stopping"), identifying: tr("identifying"), done: tr("done"), refused: tr("refused"),
-    stopped: tr("stopped, at standstill"), failed: tr("failed, at standstill"), stop_not_confirmed: tr("STOP NOT CONFIRMED"),
+    stopped: tr("stopped"), failed: tr("failed"), stop_not_confirmed: tr("STOP NOT CONFIRMED"),
     interrupted: tr("interrupted"),
   };
+  /** The state of a run, with what is known of its standstill. A list does not know it. */
+  function stateText(state, stop, history) {
+    if (state !== "stopped" && state !== "failed") return STATES[state] || state;
+    if (stop.confirmed) return state === "stopped" ? tr("stopped, at standstill") : tr("failed, at standstill");
+    if (history.some((one) => one.state === "moving")) return STATES[state];
+    return state === "stopped" ? tr("stopped before motion") : tr("failed before motion");
+  }
   const OLD = tr("No connection to tdhil serve: the values are old, and Stop on this page may not arrive. A shaft may still turn. To stop it, use the hard-wired emergency stop.");
   const byId = (id) => document.getElementById(id);
 
@@ -695,7 +702,7 @@
 
     function state() {
       const error = status.error ? `: ${errorText(status.error)}` : "";
-      byId("state").textContent = `${STATES[status.state] || status.state}${status.stage ? `: ${word(status.stage, "stage")}` : ""}${error}`;
+      byId("state").textContent = `${stateText(status.state, status.stop, status.history)}${status.stage ? `: ${word(status.stage, "stage")}` : ""}${error}`;
       byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
       const over = ENDED.includes(status.state);
       if (!over) wentOn = true;
@@ -976,7 +983,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, shareOf, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, shareOf, show, span, speedUnit, stateText, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
