@@ -619,7 +619,7 @@
   function livePage() {
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
-    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
+    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null, tooLate = false;
     let wentOn = false;                                // true if the page was opened for the run, not for its record
     try { wentOn = sessionStorage.getItem(STARTED) === run; } catch (error) { /* then a run that ended at once is not followed */ }
     const charts = window.tdhil.motion(run);
@@ -749,13 +749,14 @@
     }
 
     function stopTimes() {
-      show(byId("stop-times"), ...stopSteps((status && status.stop) || {}, Boolean(asking)));
+      const stop = (status && status.stop) || {}, late = tooLate && stop.at_rest && !stop.asked;
+      show(byId("stop-times"), ...stopSteps(stop, Boolean(asking)), late ? el("li", {}, tr("The shaft has been at standstill since {time}.", { time: clock(stop.at_rest) })) : null);
     }
 
     /** The stop is not acknowledged; or the run acknowledged it, and its drive does not react. */
     function stopAlarm() {
       const stop = (status && status.stop) || {}, over = status && ENDED.includes(status.state);
-      if (stop.asked || over) undelivered = false;
+      if (stop.asked || stop.at_rest || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
       if (saidOfRig) return;                  // the result of a stop after the run stays
@@ -780,7 +781,8 @@
       const late = setTimeout(() => { undelivered = true; stopAlarm(); }, SILENT_MS);
       try {
         const found = await call("POST", `/runs/${run}/stop`, {}, {}, 10000);
-        if (found.stop.asked || found.state === "requested" || ENDED.includes(found.state)) {
+        tooLate = Boolean(found.stop.at_rest && !found.stop.asked);
+        if (found.stop.asked || tooLate || found.state === "requested" || ENDED.includes(found.state)) {
           clearTimeout(late);
           undelivered = false;
         }

@@ -138,6 +138,18 @@ def test_only_a_confirmed_standstill_is_shown(page, served, state, moved, confir
     assert page.locator("#result .now").inner_text() == text
 
 
+def test_a_stop_after_standstill_is_not_shown_as_its_cause(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "identify"}, "local").request.id
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text="identifying").wait_for()
+    page.route("**/stop", lambda route: route.fulfill(json={**served.service.store.status(run).plain()}))
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.get_by_text("The shaft has been at standstill since").wait_for()
+    page.wait_for_timeout(2500)
+    assert not page.get_by_text("stop requested").is_visible() and not page.get_by_text("NOT DELIVERED").is_visible()
+    served.service.supervisor.stop(run, "local")
+
+
 def test_a_late_reply_does_not_revert_a_newer_one(page, served):
     run = begin(served, "brake")
     page.goto(f"/runs/{run}/live")
