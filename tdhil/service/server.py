@@ -209,7 +209,7 @@ def serve(
             sender.close()
         listening.close()
         alone.close()
-    left = sorted({*supervisor.live(), *supervisor.not_at_rest})
+    left = sorted({*supervisor.may_turn(), *supervisor.not_at_rest})
     if left:
         say(f"Standstill NOT confirmed: {', '.join(left)}. Use the hard-wired emergency stop.")
         return int(ExitCode.STOP_NOT_CONFIRMED)

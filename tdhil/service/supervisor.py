@@ -175,13 +175,17 @@ class Supervisor:
         self._indexing.finish(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
-        """Refuse new runs, stop all runs, and wait until they have ended. Return whether they have.
+        """Refuse new runs, stop those that may turn a shaft, and wait for standstill. Return whether all are there.
 
-        `not_at_rest` lists the runs without a confirmed standstill, ended or not.
+        `not_at_rest` lists the runs without a confirmed standstill, ended or not. A run that is only identified
+        continues, since a stop does not shorten that.
         """
         with self._asking:             # a start in progress is finished first; then this run is stopped, too
             self._braking = True
-        stopping = self.live()
+        stopping = self.may_turn()
+        for run in self.live():
+            if run not in stopping and lives(self.store.runs / run):
+                self.say(f"run {run} is still being identified; it continues")
         for run in stopping:
             try:
                 self.stop(run, who)
@@ -194,22 +198,35 @@ class Supervisor:
             self.say(f"Stopping run {', '.join(stopping)}. tdhil waits {within_s:.0f} s at most for standstill."
                      " If a shaft keeps turning, use the hard-wired emergency stop.")
         end_s = time.monotonic() + within_s
-        while self.live() and time.monotonic() < end_s:
+        while not all(self._rests(run, recorded=True) for run in self.live()) and time.monotonic() < end_s:
             time.sleep(LOOK_S)
+        turning = self.may_turn()
         for run in stopping:
             state = None               # unreadable: the shaft may turn
             with suppress(Exception):
                 state = self.store.status(run).state
             self.say(f"run {run}: {state or 'its state can not be read'}")
-            if run in self._live or state in (None, State.STOP_NOT_CONFIRMED):
+            if run in turning or state in (None, State.STOP_NOT_CONFIRMED):
                 self.not_at_rest.append(run)
-        return not self.live()
+        return not turning
 
     # -- requests ------------------------------------------------------------------------------------------------
 
     def live(self) -> list[str]:
         """Return the runs that have not ended."""
         return list(self._live)
+
+    def may_turn(self) -> list[str]:
+        """Return the live runs whose shaft is not known to be at standstill."""
+        return [run for run in self.live() if not self._rests(run)]
+
+    def _rests(self, run: str, *, recorded: bool = False) -> bool:
+        """Return whether a live run confirmed standstill; with ``recorded``, whether its end is in its record, too."""
+        with suppress(Exception):              # an unreadable run may turn its shaft
+            status = self.store.status(run)
+            confirmed = status.stop.confirmed is True
+            return status.state is State.IDENTIFYING or (confirmed and (status.ended or not recorded))
+        return False
 
     def ahead_of_the_index(self) -> list[str]:
         """Return the runs whose index entry is missing or out of date."""

@@ -94,6 +94,7 @@ def test_a_service_that_brakes_starts_no_more_runs(service):
     assert {service.store.status(one).stop.by for one in (loose, run)} == {"the end"}
     with pytest.raises(Conflict, match="service is ending"):
         begun(service, "hold", "b")
+    wait_for("their end", lambda: not service.supervisor.live())
     service.said.clear()
     assert service.supervisor.brake("again")
     assert service.said == []                                              # no motion, no message
@@ -109,6 +110,16 @@ def test_after_its_time_out_a_service_reports_live_runs(service):
     assert service.said[-1] == f"run {run}: moving"
     os.kill(service.store.status(run).pid, signal.SIGKILL)
     service.wait(run, "interrupted")
+
+
+def test_a_run_that_is_identified_is_not_waited_for(service):
+    """Its standstill was reported as not confirmed, with exit code 8, although it was in its record."""
+    service.supervisor.start()
+    run = begun(service, "identify", "a", "identifying")
+    assert service.supervisor.brake("the end")
+    assert (service.supervisor.not_at_rest, service.supervisor.may_turn()) == ([], [])
+    assert service.said == [f"run {run} is still being identified; it continues"]
+    assert service.store.status(run).state is State.IDENTIFYING
 
 
 def test_a_key_gives_its_run_for_the_same_request_of_the_same_user_and_rig(service):
