@@ -434,6 +434,11 @@ class Supervisor:
             except (RunRefused, CommunicationLost):
                 if (status := self.store.status(run)).ended:
                     return status
+                if self._running(run) is None and not lives(folder):
+                    by, at = self._stops.setdefault(run, (who, now()))         # `_died` records it
+                    self.note(who, "stop asked", run, status.rig, process="lost")
+                    first = status.stop if status.stop.asked else replace(status.stop, asked=at, by=by)
+                    return replace(status, stop=first)
                 self._kill_frozen(status, who)
                 # The run's process may be starting. It reads this file once it listens, so one of both ways reaches it.
                 write_json(folder / STOP_FILE, {"by": who, "at": now()})

@@ -186,12 +186,14 @@ def test_a_stop_without_a_recipient_is_reported(service, monkeypatch, dies):
         patched.setattr(supervisor_module, "send_signal", lambda pid, folder, number: sent.append(number) or False)
         if dies:
             patched.setattr(supervisor_module, "lives", lambda folder: False)
-            assert service.supervisor.stop(run, "anna").state is State.MOVING
+            patched.setattr(service.supervisor, "_running", lambda run: None)
+            found = service.supervisor.stop(run, "anna")
+            assert (found.state, found.stop.by, found.stop.asked is not None) == (State.MOVING, "anna", True)
         else:
             with pytest.raises(CommunicationLost, match="nobody answers") as lost:
                 service.supervisor.stop(run, "anna")
             assert "hard-wired emergency stop" in lost.value.next_step
-        assert sent == [signal.SIGTERM]
+        assert sent == ([] if dies else [signal.SIGTERM])
     service.supervisor.stop(run, "anna")
     service.wait(run, "stopped")
 
@@ -301,6 +303,25 @@ def test_a_lost_process_is_handled_once_and_the_others_as_usual(service, monkeyp
     assert any(f"run {run}: its process is gone; stopping the drive" in one for one in service.said)
     assert not (service.store.place(run) / ".reserve").exists()
     assert all(child.poll() is not None for child in service.supervisor._children.values())
+
+
+def test_a_stop_just_after_the_loss_of_the_process_is_in_the_record(service, monkeypatch):
+    """The service stopped the drive already, and the page said that the stop was not delivered."""
+    monkeypatch.setattr(service.supervisor, "_look", lambda: None)     # the loss is not seen yet
+    service.supervisor.start()
+    run = begun(service)
+    child = service.supervisor._children[run]
+    child.kill()
+    child.wait()
+    found = service.supervisor.stop(run, "anna")
+    assert (found.state, found.stop.by) == (State.MOVING, "anna")
+    service.supervisor.stop(run, "berta")
+    service.supervisor._look_at(run)
+    service.wait(run, "interrupted")
+    status = service.store.status(run)
+    assert (status.stop.by, status.stop.asked) == ("anna", found.stop.asked)
+    wait_for("its end", lambda: not service.supervisor.live())
+    assert not (service.store.place(run) / STOP_FILE).exists()
 
 
 def test_a_failure_of_one_run_does_not_affect_the_others(service, monkeypatch):
