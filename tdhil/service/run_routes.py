@@ -74,7 +74,7 @@ async def runs_page(site: Site, request: Request, body: None) -> RunsPageView:
     """Return a page of the list of runs."""
     query, wanted = request.query_params, _filter(request)
     page, key, way = query.get("page", "1"), query.get("sort", NEWEST.key), query.get("order", "desc")
-    if not page.isdecimal() or not 1 <= int(page) <= LAST_PAGE:
+    if whole_number(page, 1, LAST_PAGE) is None:
         raise request_wrong(f"must be 1 to {LAST_PAGE}", "page")
     if key not in SORTS or way not in ("asc", "desc"):
         raise request_wrong("is not a sort order of this list", "sort" if key not in SORTS else "order",
