@@ -216,9 +216,10 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
             if known.uploaded is not None:
                 raise request_wrong("is an uploaded recording: it is not certain that it is of this drive",
                                     f"run {run}", "Calibrate with tdhil calibrate torque")
-            if not site.store.status(run).ended or not (site.store.place(run) / LOG).is_file():
+            if not (ended := site.store.status(run).ended) or not (site.store.place(run) / LOG).is_file():
                 raise UsageError("the run has no finished log", where=f"run {run}",
-                                 next_step="Wait until it has ended", entry=MessageCode.NOT_READY)
+                                 next_step="The run ended without a log" if ended else "Wait until it has ended",
+                                 entry=MessageCode.NOT_READY)
 
     await off(check)
     asked = {"without": body.without, "with_body": body.with_body, "added_kg_m2": body.added_kg_m2,

@@ -256,8 +256,9 @@ def _answers(made: ReplayView, asked: Mapping[str, Any]) -> bool:
 
 def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> ReplayView:
     folder = site.store.place(which)
-    if not site.store.status(which).ended or not (folder / LOG).is_file():
-        raise UsageError("the run has no finished log", where=f"run {which}", next_step="Wait until it has ended",
+    if not (ended := site.store.status(which).ended) or not (folder / LOG).is_file():
+        raise UsageError("the run has no finished log", where=f"run {which}",
+                         next_step="The run ended without a log" if ended else "Wait until it has ended",
                          entry=MessageCode.NOT_READY)
     with site.replay_names:
         (folder / "replays").mkdir(exist_ok=True)

@@ -258,3 +258,24 @@ def test_the_worker_calibrates_as_the_command_does(tmp_path, monkeypatch):
     factor = found["calibration_factor"]
     assert factor["low"] <= 1.0 / bodies.SCALE <= factor["high"]
     assert any("standard uncertainty of the body" in warning for warning in found["warnings"])
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("log.mcap", "The run ended without a log"), ("result.json", "The run ended without a result"),
+    ("report.pdf", "The run ended without a report"), ("samples.csv", "The run ended without a log"),
+    ("trace.csv", "Only a run from an uploaded trace has this file"),
+    ("evidence.zip", "Make the evidence first"),
+])
+def test_a_file_of_an_ended_run_is_not_waited_for(call, service, name, text):
+    run = call.start("a", "unseen")["id"]
+    service.wait(run, "stop_not_confirmed")
+    (service.store.place(run) / "run.mcap").unlink(missing_ok=True)
+    assert call("GET", f"/runs/{run}/{name}", 404)["error"]["next_step"] == text
+    assert call("POST", f"/runs/{run}/replays", 422, json={})["error"]["next_step"] == "The run ended without a log"
+
+
+def test_a_file_of_a_live_run_is_waited_for(call, service):
+    run = call.start("a", "hold")["id"]
+    service.wait(run, "moving")
+    for name in ("result.json", "evidence.zip"):
+        assert call("GET", f"/runs/{run}/{name}", 404)["error"]["next_step"] == "Wait until the run has ended"
