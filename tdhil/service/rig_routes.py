@@ -12,7 +12,7 @@ from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import apis
 from tdhil.service.run_routes import asks_for
-from tdhil.service.run_state import Conflict, FolderMissing, NotAllowed, request_wrong
+from tdhil.service.run_state import FolderMissing, NotAllowed, request_wrong
 from tdhil.service.schemas import (
     CalibrationBody,
     CalibrationView,
@@ -95,9 +95,7 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
     if not found.simulated:
         raise NotAllowed("only a simulated rig is measured from here", where=f"rig {found.id}",
                          next_step="A run on a real drive measures the rate itself, before motion")
-    if site.supervisor.turning():
-        raise Conflict("a real shaft is turning, and a measurement would load this computer", where=f"rig {found.id}",
-                       next_step="Measure when that run has ended")
+    await off(lambda: site.supervisor.refuse_turning(f"rig {found.id}"))
     asked = {"rig_file": str(found.path.resolve()), "options": {}}
     return PaceView(found.id, await site.work("pace", None, asked))
 
@@ -105,9 +103,7 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
 async def check_rig(site: Site, request: Request, body: Any) -> list[DoctorFinding]:
     """Check a rig's drive without motion. Raises Conflict while a real shaft may turn."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
-    if site.supervisor.turning():
-        raise Conflict("a real shaft is turning, and a check could disturb its bus", where=f"rig {found.id}",
-                       next_step="Check when that run has ended")
+    await off(lambda: site.supervisor.refuse_turning(f"rig {found.id}"))
     site.supervisor.note(principal(request).name, "rig checked", None, found.id)
     asked = {"rig_file": str(found.path.resolve()), "runs_folder": str(site.store.runs)}
     return [DoctorFinding(**one) for one in (await site.work("check", None, asked))["checks"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -272,8 +273,10 @@ def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> Repl
 async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
     """Execute a replay as soon as no shaft of this service may turn."""
     try:
-        while await off(site.supervisor.turning):
+        while (holder := await off(site.supervisor.turned_by)) is not None:
+            site.waiting_replays[which, view.name] = replace(view, state="delayed", holder=holder)
             await anyio.sleep(0.5)
+        site.waiting_replays[which, view.name] = view
         found = await site.work("replay", which, view.asked)
         done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
     except TdhilError as error:

@@ -140,15 +140,16 @@ class RigFileView:
 
 @dataclass(frozen=True)
 class ReplayView:
-    """A replay: its settings and its result."""
+    """A replay: its settings and its result. ``holder``: holds a drive, so the replay is delayed until it has ended."""
 
     name: str
     asked: dict[str, Any]
     at: str
     by: str
-    state: Literal["waiting", "done", "failed"]
+    state: Literal["waiting", "delayed", "done", "failed"]
     result: dict[str, Any] | None = None
     error: Told | None = None
+    holder: str | None = None
 
 
 @dataclass(frozen=True)

@@ -800,13 +800,24 @@ class Supervisor:
         thread.start()
         self._begun = [one for one in self._begun if one.is_alive()] + [thread]
 
-    def turning(self) -> bool:
-        """Return whether a real shaft of this computer may turn: a run moves, or a drive is held."""
+    def turned_by(self) -> str | None:
+        """Return what may turn a real shaft of this computer: a run, or the holder of a drive; None without any."""
         for run in self.live():
             with suppress(Exception):
                 if not self.store.request(run).simulated and self.store.status(run).state in MAY_TURN:
-                    return True
-        return bool(holders())
+                    return f"run {run}"
+        return next((str(one) for one in holders()), None)
+
+    def turning(self) -> bool:
+        """Return whether a real shaft of this computer may turn: a run moves, or a drive is held."""
+        return self.turned_by() is not None
+
+    def refuse_turning(self, where: str) -> None:
+        """Raise Conflict while a real shaft of this computer may turn."""
+        if (holder := self.turned_by()) is not None:
+            raise Conflict(f"a drive on this computer is held by {holder}, so a shaft may turn", where=where,
+                           holder=holder, next_step="Nothing was done, since it could disturb the bus or the"
+                           " control loop of that drive. Repeat the request when the drive is free")
 
 
 def _tdhil_stop(rig_file: Path) -> list[str]:

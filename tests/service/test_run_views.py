@@ -85,6 +85,21 @@ def test_the_example_rigs_are_simulated():
 def test_a_drive_in_use_may_turn(service):
     with hold("a drive of this test"):
         assert service.supervisor.turning()
+        assert service.supervisor.turned_by().startswith(f"process {os.getpid()} (")
+
+
+def test_a_replay_states_for_which_drive_it_waits(call, service, monkeypatch):
+    """The page showed "Identifying again" with a progress bar, although nothing was computed."""
+    run = call.start("a", "done")["id"]
+    service.wait(run, "done")
+    monkeypatch.setattr(service.supervisor, "work", lambda *asked: {"document": {"verdict": "valid"}})
+    with hold("a drive of this test"):
+        call("POST", f"/runs/{run}/replays", 202, json={"model": "rigid"})
+        found = wait_for("its delay", lambda: next(
+            (one for one in call("GET", f"/runs/{run}", 200)["replays"] if one["state"] == "delayed"), None))
+        assert found["holder"].startswith(f"process {os.getpid()} (")
+    wait_for("its end", lambda: call("GET", f"/runs/{run}/replays/001", 200)["state"] == "done")
+    assert call("GET", f"/runs/{run}", 200)["replays"][0]["holder"] is None
 
 
 @pytest.fixture
