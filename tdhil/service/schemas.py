@@ -777,7 +777,7 @@ ROUTES: Final = (
     Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
           _file("application/json"), errors=(404,), headers=_RANGE),
     Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made at the first request",
-          "viewer", _file("text/csv"), errors=(404, 422), headers=_RANGE),
+          "viewer", _file("text/csv"), errors=(404, 422, 507), headers=_RANGE),
     Route("POST", "/runs/{run}/evidence", "make_evidence", "Make the archive of a run, scrubbed, for others to check",
           "engineer", {201: EvidenceView}, EVIDENCE, (403, 404, 409, 422, 503)),
     Route("GET", "/runs/{run}/evidence.zip", "evidence", "The archive of evidence", "viewer",

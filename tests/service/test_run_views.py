@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import os
@@ -15,6 +16,7 @@ import pytest
 
 from profiles import STAGE_NUMBERS
 from tdhil.buses import all_buses
+from tdhil.errors import UsageError
 from tdhil.service import fleets as fleets_module
 from tdhil.service import worker
 from tdhil.service.fleets import Fleets
@@ -23,7 +25,7 @@ from tdhil.service.start_request import Rigs
 from tdhil.service.store import read_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
-from tests.service.conftest import HANGS_S, wait_for
+from tests.service.conftest import HANGS_S, play_uploads, wait_for
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -60,6 +62,30 @@ def test_samples_are_a_table(call, service, tmp_path, monkeypatch):
     service.wait(run, "stopped")
     (tmp_path / "samples.csv").replace(service.store.place(run) / "samples.csv")
     assert call("GET", f"/runs/{run}/samples.csv", 200).text.startswith("time_s,")
+
+
+def test_a_full_disk_is_reported_as_such_while_samples_are_written(call, service, tmp_path, monkeypatch):
+    """It gave HTTP 422 with the text of another program."""
+    run = call.start()["id"]
+    service.wait(run, "done")
+    write(service.store.place(run) / "run.mcap")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(csv, "writer", full)
+    play_uploads(service, monkeypatch)
+    found = call("GET", f"/runs/{run}/samples.csv", 507)["error"]
+    assert (found["what"], found["next_step"]) == ("the disk is full (No space left on device)",
+                                                   "Free some disk space, then repeat the request")
+    assert not list(service.store.place(run).glob("*samples.csv"))
+
+
+def test_samples_of_a_file_that_is_no_log_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.mcap").write_bytes(b"no log")
+    with pytest.raises(UsageError):
+        worker.samples({"folder": str(tmp_path)})
 
 
 def test_possible_rehearsals_are_accepted_at_every_stage(call):
