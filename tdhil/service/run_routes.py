@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -38,6 +38,7 @@ from tdhil.service.schemas import (
     SignOffBody,
     plain,
 )
+from tdhil.service.site import BEGUN_BY
 from tdhil.service.start_request import ValuesWrong, options_of
 from tdhil.service.store import LOG, write_json
 from tdhil.version import __version__
@@ -262,12 +263,24 @@ def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> Repl
                          next_step="The run ended without a log" if ended else "Wait until it has ended",
                          entry=MessageCode.NOT_READY)
     with site.replay_names:
-        (folder / "replays").mkdir(exist_ok=True)
+        _written(lambda: (folder / "replays").mkdir(exist_ok=True), which)
         taken = [int(name) for name, _ in site.store.replays(which)] + [
             int(name) for at, name in site.waiting_replays if at == which]
         view = ReplayView(f"{max(taken, default=0) + 1:03d}", asked, now(), who, "waiting")
+        kept = {**plain(view, ReplayView), BEGUN_BY: site.start_id}
+        _written(lambda: write_json(folder / "replays" / f"{view.name}.json", kept), which)
         site.waiting_replays[which, view.name] = view
     return view
+
+
+def _written(write: Callable[[], None], which: str) -> None:
+    """Write a part of an accepted replay. Raises LogError."""
+    try:
+        write()
+    except OSError as error:
+        raise LogError(f"the replay can't be written ({error.strerror or error})", where=f"run {which}",
+                       next_step="Nothing was started. Free some disk space, or check the folder"
+                       " of the service") from error
 
 
 async def _replay_later(site: Site, which: str, view: ReplayView) -> None:

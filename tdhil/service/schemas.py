@@ -764,7 +764,7 @@ ROUTES: Final = (
     Route("POST", "/runs/{run}/acceptance", "sign_acceptance", "Sign the acceptance of a run, once", "engineer",
           {200: AcceptanceView}, SignatureBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result is kept", "operator",
-          {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422)),
+          {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422, 503)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
     Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
           _file("application/octet-stream"), errors=(404,), headers=_RANGE),

@@ -71,6 +71,8 @@ from tdhil.service.store import (
 )
 from tdhil.session import Holder, holder_of, holders
 
+KEPT_WORK: Final = "recover"
+"""Task that outlives the service: no page waits for it."""
 LOOK_S: Final = 0.2
 """Interval of the check whether a run is alive, s."""
 INDEX_LOOKS: Final = 10
@@ -141,6 +143,8 @@ class Supervisor:
         self.pace = RequestPace()
         self.not_at_rest: list[str] = []               # runs stopped by `brake`, standstill not confirmed
         self._end = threading.Event()
+        self._workers: set[subprocess.Popen[bytes]] = set()
+        self._working = threading.Lock()
         self._thread: threading.Thread | None = None
         self._begun: list[threading.Thread] = []
         self._notes = Jobs("audit", say)
@@ -165,8 +169,11 @@ class Supervisor:
         self._thread.start()
 
     def close(self) -> None:
-        """End the supervision. Runs continue."""
-        self._end.set()
+        """End the supervision and the computations of pages. Runs continue."""
+        with self._working:
+            self._end.set()
+            for worker in self._workers:
+                worker.terminate()
         if self._thread is not None:
             self._thread.join(5.0)
         for thread in self._begun:
@@ -727,15 +734,28 @@ class Supervisor:
         self._index(run)
 
     def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Compute a task in its own process, at a lower priority than all runs. Raises Refused."""
+        """Compute a task in its own process, at a lower priority than all runs. Raises RunRefused, and Conflict if the
+        service ends.
+        """
         command = [sys.executable, "-m", "tdhil.service.worker", what]
         question = {"folder": None if run is None else str(self.store.place(run)), **asked}
-        done = subprocess.run(command, input=json.dumps(question).encode(), capture_output=True, check=False,
-                              start_new_session=True)
+        with self._working:
+            if self._end.is_set() and what != KEPT_WORK:
+                raise service_ended(what)
+            worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                                      start_new_session=True)
+            if what != KEPT_WORK:
+                self._workers.add(worker)
         try:
-            found: dict[str, Any] = json.loads(done.stdout)
+            reply, said = worker.communicate(json.dumps(question).encode())
+        finally:
+            self._workers.discard(worker)
+        try:
+            found: dict[str, Any] = json.loads(reply)
         except ValueError:
-            text = done.stderr.decode("utf-8", "replace").strip().splitlines()
+            if self._end.is_set():
+                raise service_ended(what) from None
+            text = said.decode("utf-8", "replace").strip().splitlines()
             found = {"error": Told("Error", "the work failed", text[-1] if text else "", what, "", 1,
                                    MessageCode.WORKER_PROCESS_LOST.code).__dict__}
         if found.get("error"):
@@ -818,6 +838,11 @@ class Supervisor:
             raise Conflict(f"a drive on this computer is held by {holder}, so a shaft may turn", where=where,
                            holder=holder, next_step="Nothing was done, since it could disturb the bus or the"
                            " control loop of that drive. Repeat the request when the drive is free")
+
+
+def service_ended(where: str) -> Conflict:
+    """Return the refusal of a task that the service began, and did not finish before its own end."""
+    return Conflict("the service ended before this was done", where=where, next_step="Repeat it")
 
 
 def _tdhil_stop(rig_file: Path) -> list[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -211,6 +212,7 @@ def main(arguments: list[str]) -> int:
     """Compute one task. Return 0; the reply on stdout contains the result or the error."""
     with suppress(OSError, AttributeError):
         os.nice(NICE.get(arguments[0], USUAL_NICE))
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))      # unfinished files are removed
     with suppress(OSError):                    # without memory, the system ends this process first
         Path("/proc/self/oom_score_adj").write_text("500")
     out = os.fdopen(os.dup(1), "w")

@@ -25,7 +25,7 @@ from tdhil.service.start_request import Rigs
 from tdhil.service.store import read_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
-from tests.service.conftest import HANGS_S, play_uploads, wait_for
+from tests.service.conftest import HANGS_S, Service, play_uploads, wait_for
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -126,6 +126,22 @@ def test_a_replay_states_for_which_drive_it_waits(call, service, monkeypatch):
         assert found["holder"].startswith(f"process {os.getpid()} (")
     wait_for("its end", lambda: call("GET", f"/runs/{run}/replays/001", 200)["state"] == "done")
     assert call("GET", f"/runs/{run}", 200)["replays"][0]["holder"] is None
+
+
+def test_a_replay_that_the_end_of_the_service_interrupted_has_failed(call, service, tmp_path, monkeypatch):
+    """It was accepted, and then lost without a trace."""
+    run = call.start("a", "done")["id"]
+    service.wait(run, "done")
+    goes_on = threading.Event()
+    monkeypatch.setattr(service.supervisor, "work", lambda *asked: goes_on.wait(HANGS_S) and {"document": {}})
+    call("POST", f"/runs/{run}/replays", 202, json={"model": "rigid"})
+    assert [one.state for one in service.web.replays(run)] == ["waiting"]
+    after = Service(tmp_path / "data", None)
+    (found,) = after.web.replays(run)
+    assert (found.state, found.asked) == ("failed", {"model": "rigid"})
+    assert (found.error.what, found.error.next_step) == ("the service ended before this was done", "Repeat it")
+    goes_on.set()
+    wait_for("its end", lambda: [one.state for one in service.web.replays(run)] == ["done"])
 
 
 @pytest.fixture

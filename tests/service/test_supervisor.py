@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -361,13 +362,40 @@ def test_a_failed_computation_gives_the_reason(service, monkeypatch):
     with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
     assert refused.value.reported.exit_code != 0
-    broken = SimpleNamespace(stdout=b"is not JSON", stderr=b"first\nkilled\n")
-    monkeypatch.setattr(supervisor_module.subprocess, "run", lambda *_, **__: broken)
+    replies = [(b"is not JSON", b"first\nkilled\n"), (b"is not JSON", b"")]
+
+    class Broken:
+        def __init__(self, *_: Any, **__: Any) -> None:
+            pass
+
+        def communicate(self, question: bytes) -> tuple[bytes, bytes]:
+            return replies.pop(0)
+
+    monkeypatch.setattr(supervisor_module.subprocess, "Popen", Broken)
     with pytest.raises(RunRefused) as refused:
         service.supervisor.work("plan", None, {})
     assert (refused.value.reported.message, refused.value.reported.what) == ("the work failed", "killed")
-    broken.stderr = b""
     with pytest.raises(RunRefused):
+        service.supervisor.work("plan", None, {})
+
+
+def test_the_end_of_the_service_ends_a_computation(service, monkeypatch):
+    """It waited for it, without a message, and its result was lost."""
+    begun, real = [], subprocess.Popen
+
+    def slow(command: list[str], **more: Any) -> Any:
+        begun.append(real([sys.executable, "-c", "import sys, time; sys.stdin.read(); time.sleep(3600)"], **more))
+        return begun[0]
+
+    monkeypatch.setattr(supervisor_module.subprocess, "Popen", slow)
+    with ThreadPoolExecutor(1) as thread:
+        work = thread.submit(service.supervisor.work, "replay", None, {})
+        wait_for("the process", lambda: service.supervisor._workers)
+        service.supervisor.close()
+        with pytest.raises(Conflict, match="the service ended before this was done"):
+            work.result()
+    assert begun[0].wait(60.0) == -signal.SIGTERM
+    with pytest.raises(Conflict, match="the service ended"):
         service.supervisor.work("plan", None, {})
 
 
