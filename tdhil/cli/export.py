@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import shutil
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,13 +17,6 @@ if TYPE_CHECKING:
     from drivers import RawFrame
 
 SUFFIXES: Final = {"candump": ".log", "asc": ".asc", "csv": ".csv", "parquet": ".parquet"}
-COLUMNS: Final = (
-    "time_s", "speed_rad_s", "torque_nm", "torque_demand_nm", "commanded_speed_rad_s", "commanded_torque_nm",
-    "mode", "state", "status", "fresh", "limit_active", "standstill", "age_s", "half_width_s",
-    "simulated", "position_rad",
-)
-"""Columns of a table. `tdhil replay` reads the first three from a CSV."""
-
 _CAN_ONLY: Final = ("candump", "asc")
 _LARGEST_STANDARD: Final = 0x7FF
 
@@ -43,7 +34,7 @@ def run(namespace: argparse.Namespace) -> int:
     """Export. Exit 0: everything; 3: the log is not complete, and its readable part was written; 10: nothing is
     readable.
     """
-    from tdhil.recording import read_run
+    from tdhil.recording import read_run, write_samples
     from tdhil.report import SIMULATED, stderr_console
 
     path: Path = namespace.log
@@ -59,7 +50,7 @@ def run(namespace: argparse.Namespace) -> int:
             if namespace.to in _CAN_ONLY:
                 written = _write_frames(namespace.to, path, target, found.epoch_ns)
             else:
-                write = _write_csv if namespace.to == "csv" else _write_parquet
+                write = write_samples if namespace.to == "csv" else _write_parquet
                 written = write(path, target, int(found.recording.simulated))
     except LogError as error:
         raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
@@ -104,40 +95,18 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
     return count
 
 
-def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:
-    from tdhil.recording import read_cycles
-
-    for command, one in read_cycles(path):
-        speed, torque = (None, None) if command is None else (command.speed_rad_s, command.torque_nm)
-        yield (
-            one.time_s, one.speed_rad_s, one.torque_nm, one.torque_demand_nm, speed, torque,
-            None if one.mode is None else one.mode.value, one.state.value, one.status, int(one.fresh),
-            int(one.limit_active), int(one.standstill), one.age_s, one.half_width_s, simulated,
-            one.position_rad,
-        )
-
-
-def _write_csv(path: Path, target: Path, simulated: int) -> int:
-    """Write numbers with all digits, so that they are read back unchanged."""
-    count = 0
-    with target.open("x", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(COLUMNS)
-        for row in _rows(path, simulated):
-            table.writerow(["" if cell is None else cell for cell in row])
-            count += 1
-    return count
-
-
 def _write_parquet(path: Path, target: Path, simulated: int) -> int:
     """Write the same table, typed; DuckDB keeps all bits of its numbers."""
+    from tdhil.recording import SAMPLE_COLUMNS, write_samples
+
     texts, counts = {"mode", "state"}, {"status", "fresh", "limit_active", "standstill", "simulated"}
     typed = ", ".join(
-        f"{name}: '{'VARCHAR' if name in texts else 'BIGINT' if name in counts else 'DOUBLE'}'" for name in COLUMNS
+        f"{name}: '{'VARCHAR' if name in texts else 'BIGINT' if name in counts else 'DOUBLE'}'"
+        for name in SAMPLE_COLUMNS
     )
     with TemporaryDirectory(prefix="tdhil-export-") as folder, closing(_duckdb().connect()) as base:
         table = Path(folder) / "samples.csv"
-        count = _write_csv(path, table, simulated)
+        count = write_samples(path, table, simulated)
         whole, quoted = Path(folder) / "samples.parquet", folder.replace("'", "''")
         base.execute(f"COPY (SELECT * FROM read_csv('{quoted}/samples.csv', header=true, columns={{{typed}}})) "
                      f"TO '{quoted}/samples.parquet' (FORMAT parquet)")

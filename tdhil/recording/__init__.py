@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.run_end import RunEnd as RunEnd, find_ended as find_ended
     from tdhil.recording.run_log import RunLog as RunLog
+    from tdhil.recording.sample_table import SAMPLE_COLUMNS as SAMPLE_COLUMNS, write_samples as write_samples
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
     from tdhil.recording.trace_log import write_trace_log as write_trace_log
 else:
@@ -65,6 +66,7 @@ else:
                      "Segment Stage SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort counts_until_s",
         "run_end": "RunEnd find_ended",
         "run_log": "RunLog",
+        "sample_table": "SAMPLE_COLUMNS write_samples",
         "salvage": "Salvage examine write_copy",
         "trace_log": "write_trace_log",
     })

@@ -127,12 +127,15 @@ class Watcher:
         self.log: RunLog | None = None
 
     def asked_to_stop(self, who: str) -> None:
-        """Record a requested stop. `cycle` later records the first sample of the braking drive."""
+        """Record a requested stop. `cycle` later records the first sample of the braking drive.
+
+        A request after standstill stops nothing and is not part of the record. The audit has it.
+        """
         self._looking = True
         at = now()
 
         def step(status: Status) -> Status:
-            if status.stop.asked is None and not status.ended:
+            if status.stop.asked is None and status.stop.at_rest is None and not status.ended:
                 status = replace(status, stop=replace(status.stop, asked=at, by=who))
             return status.to(State.STOPPING, at) if status.state is State.MOVING else status
 

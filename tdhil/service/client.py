@@ -176,7 +176,7 @@ class Client:
     def replay(self, run: str, **asked: Any) -> dict[str, Any]:
         """Identify a run again with another ``model``, ``tolerance`` or ``confidence``. Return when it is done."""
         found = self._object("POST", f"/runs/{quote(run, safe='')}/replays", asked)
-        while found["state"] == "waiting":
+        while found["state"] in ("waiting", "delayed"):
             time.sleep(0.2)
             found = self._object("GET", f"/runs/{quote(run, safe='')}/replays/{found['name']}")
         return found

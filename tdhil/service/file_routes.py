@@ -12,10 +12,11 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from tdhil.errors import MessageCode, UsageError
 from tdhil.service.acceptance_signature import FILE
 from tdhil.service.access import principal
+from tdhil.service.evidence_request import ARCHIVE
 from tdhil.service.letterhead import outdated_reports
 from tdhil.service.middleware import off, whole_number
 from tdhil.service.routing import apis
-from tdhil.service.run_state import NotThere
+from tdhil.service.run_state import NotThere, page_text
 from tdhil.service.schemas import PictureView
 from tdhil.service.store import LOG, RECOVERED
 from tdhil.service.uploads import TRACE
@@ -27,6 +28,13 @@ if TYPE_CHECKING:
     from tdhil.report import ShownPicture
     from tdhil.service.site import Site
 
+MISSING: Final = {
+    LOG: page_text("The run ended without a log"), "samples.csv": page_text("The run ended without a log"),
+    "result.json": page_text("The run ended without a result"), ARCHIVE: page_text("Make the evidence first"),
+    RECOVERED: page_text("Only a log that broke off has a recovered copy"),
+    TRACE: page_text("Only a run from an uploaded trace has this file"),
+}
+"""Why an ended run has no such file, or what makes it."""
 REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
 PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
 """Content security policies of a report and of a picture: both contain their own style, and run no script."""
@@ -131,7 +139,10 @@ async def file_of(site: Site, request: Request, name: str, media: str, *, shown:
     run, who = request.path_params["run"], principal(request).name
     path = (await off(lambda: site.store.place(run))) / name
     if not path.is_file():
-        raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="Wait until the run has ended")
+        ended = (await off(lambda: site.store.status(run))).ended
+        without = MISSING.get(name, page_text("The run ended without a report"))
+        raise NotThere(f"this run has no {name}", where=f"run {run}",
+                       next_step=without if ended else page_text("Wait until the run has ended"))
     rig = (await off(lambda: site.store.request(run))).rig
     if request.method == "GET":
         site.supervisor.note(who, f"downloaded {name}", run, rig)

@@ -85,9 +85,10 @@ class RequestGuard:
         origin = connection.headers.get("origin")
         if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
             return None
-        elsewhere = origin is not None and (
-            urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc.lower() != host.lower()
-        )
+        elsewhere = origin is not None
+        with suppress(ValueError):
+            sent_by = urlsplit(origin or "")
+            elsewhere &= sent_by.scheme not in ("http", "https") or sent_by.netloc.lower() != host.lower()
         if changes and (elsewhere or connection.headers.get("sec-fetch-site") in ("cross-site", "same-site")):
             return NotAllowed("a page of another site sent this request", where=f"origin {(origin or '?')[:100]}")
         return None

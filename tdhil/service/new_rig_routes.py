@@ -8,7 +8,6 @@ from tdhil.service.access import principal
 from tdhil.service.middleware import off
 from tdhil.service.new_rig import draft_of, new_rig_view
 from tdhil.service.routing import apis
-from tdhil.service.run_state import Conflict
 from tdhil.service.schemas import DraftBody, DraftView, NewRigBody, NewRigView, RigView, ScanView, adapter
 from tdhil.service.start_request import ValuesWrong
 
@@ -38,9 +37,7 @@ async def scan_bus(site: Site, request: Request, body: DraftBody) -> ScanView:
     """Scan for drives. Raises Conflict while a real shaft turns, and UsageError if the bus may have another master."""
     if not body.alone:
         raise ValuesWrong([("alone", "A scan requests data from every node. Confirm that no other master is active.")])
-    if site.supervisor.turning():
-        raise Conflict("a real shaft is turning, and a scan could disturb its bus", where="scan",
-                       next_step="Scan when that run has ended")
+    await off(lambda: site.supervisor.refuse_turning("scan"))
     who = principal(request).name
     site.supervisor.note(who, "bus scanned", None, None, profile=body.profile, address=dict(body.address))
     plain: dict[str, Any] = adapter(DraftBody).dump_python(body, mode="json")

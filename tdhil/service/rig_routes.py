@@ -7,12 +7,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.buses import DoctorFinding
-from tdhil.errors import MessageCode, UsageError
+from tdhil.errors import ExitCode, MessageCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import apis
 from tdhil.service.run_routes import asks_for
-from tdhil.service.run_state import Conflict, NotAllowed, request_wrong
+from tdhil.service.run_state import FolderMissing, NotAllowed, request_wrong
 from tdhil.service.schemas import (
     CalibrationBody,
     CalibrationView,
@@ -95,9 +95,7 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
     if not found.simulated:
         raise NotAllowed("only a simulated rig is measured from here", where=f"rig {found.id}",
                          next_step="A run on a real drive measures the rate itself, before motion")
-    if site.supervisor.turning():
-        raise Conflict("a real shaft is turning, and a measurement would load this computer", where=f"rig {found.id}",
-                       next_step="Measure when that run has ended")
+    await off(lambda: site.supervisor.refuse_turning(f"rig {found.id}"))
     asked = {"rig_file": str(found.path.resolve()), "options": {}}
     return PaceView(found.id, await site.work("pace", None, asked))
 
@@ -105,9 +103,7 @@ async def pace(site: Site, request: Request, body: None) -> PaceView:
 async def check_rig(site: Site, request: Request, body: Any) -> list[DoctorFinding]:
     """Check a rig's drive without motion. Raises Conflict while a real shaft may turn."""
     found = await off(lambda: site.supervisor.rigs.get(request.path_params["rig"]))
-    if site.supervisor.turning():
-        raise Conflict("a real shaft is turning, and a check could disturb its bus", where=f"rig {found.id}",
-                       next_step="Check when that run has ended")
+    await off(lambda: site.supervisor.refuse_turning(f"rig {found.id}"))
     site.supervisor.note(principal(request).name, "rig checked", None, found.id)
     asked = {"rig_file": str(found.path.resolve()), "runs_folder": str(site.store.runs)}
     return [DoctorFinding(**one) for one in (await site.work("check", None, asked))["checks"]]
@@ -169,7 +165,10 @@ async def stop_rig(site: Site, request: Request, body: Any) -> StoppedView:
     run, holder, found = await site.at_once(look)          # for each request: a run may have begun since another stop
     if run is not None:
         drive = site.stop_beside(run, holder, who)
-        await site.shared_stop(f"run {run}", partial(site.supervisor.stop, run, who), noted)
+        try:
+            await site.shared_stop(f"run {run}", partial(site.supervisor.stop, run, who), noted)
+        except FolderMissing as error:
+            return StoppedView(which, [run], int(ExitCode.STOP_NOT_CONFIRMED), error.what)
         code, said = (None, "") if drive is None else await drive
         return StoppedView(which, [run], code, said)
     assert found is not None
@@ -213,9 +212,10 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
             if known.uploaded is not None:
                 raise request_wrong("is an uploaded recording: it is not certain that it is of this drive",
                                     f"run {run}", "Calibrate with tdhil calibrate torque")
-            if not site.store.status(run).ended or not (site.store.place(run) / LOG).is_file():
+            if not (ended := site.store.status(run).ended) or not (site.store.place(run) / LOG).is_file():
                 raise UsageError("the run has no finished log", where=f"run {run}",
-                                 next_step="Wait until it has ended", entry=MessageCode.NOT_READY)
+                                 next_step="The run ended without a log" if ended else "Wait until it has ended",
+                                 entry=MessageCode.NOT_READY)
 
     await off(check)
     asked = {"without": body.without, "with_body": body.with_body, "added_kg_m2": body.added_kg_m2,

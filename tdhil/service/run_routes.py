@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,6 +38,7 @@ from tdhil.service.schemas import (
     SignOffBody,
     plain,
 )
+from tdhil.service.site import BEGUN_BY
 from tdhil.service.start_request import ValuesWrong, options_of
 from tdhil.service.store import LOG, write_json
 from tdhil.version import __version__
@@ -74,7 +76,7 @@ async def runs_page(site: Site, request: Request, body: None) -> RunsPageView:
     """Return a page of the list of runs."""
     query, wanted = request.query_params, _filter(request)
     page, key, way = query.get("page", "1"), query.get("sort", NEWEST.key), query.get("order", "desc")
-    if not page.isdecimal() or not 1 <= int(page) <= LAST_PAGE:
+    if whole_number(page, 1, LAST_PAGE) is None:
         raise request_wrong(f"must be 1 to {LAST_PAGE}", "page")
     if key not in SORTS or way not in ("asc", "desc"):
         raise request_wrong("is not a sort order of this list", "sort" if key not in SORTS else "order",
@@ -256,23 +258,38 @@ def _answers(made: ReplayView, asked: Mapping[str, Any]) -> bool:
 
 def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> ReplayView:
     folder = site.store.place(which)
-    if not site.store.status(which).ended or not (folder / LOG).is_file():
-        raise UsageError("the run has no finished log", where=f"run {which}", next_step="Wait until it has ended",
+    if not (ended := site.store.status(which).ended) or not (folder / LOG).is_file():
+        raise UsageError("the run has no finished log", where=f"run {which}",
+                         next_step="The run ended without a log" if ended else "Wait until it has ended",
                          entry=MessageCode.NOT_READY)
     with site.replay_names:
-        (folder / "replays").mkdir(exist_ok=True)
+        _written(lambda: (folder / "replays").mkdir(exist_ok=True), which)
         taken = [int(name) for name, _ in site.store.replays(which)] + [
             int(name) for at, name in site.waiting_replays if at == which]
         view = ReplayView(f"{max(taken, default=0) + 1:03d}", asked, now(), who, "waiting")
+        kept = {**plain(view, ReplayView), BEGUN_BY: site.start_id}
+        _written(lambda: write_json(folder / "replays" / f"{view.name}.json", kept), which)
         site.waiting_replays[which, view.name] = view
     return view
+
+
+def _written(write: Callable[[], None], which: str) -> None:
+    """Write a part of an accepted replay. Raises LogError."""
+    try:
+        write()
+    except OSError as error:
+        raise LogError(f"the replay can't be written ({error.strerror or error})", where=f"run {which}",
+                       next_step="Nothing was started. Free some disk space, or check the folder"
+                       " of the service") from error
 
 
 async def _replay_later(site: Site, which: str, view: ReplayView) -> None:
     """Execute a replay as soon as no shaft of this service may turn."""
     try:
-        while await off(site.supervisor.turning):
+        while (holder := await off(site.supervisor.turned_by)) is not None:
+            site.waiting_replays[which, view.name] = replace(view, state="delayed", holder=holder)
             await anyio.sleep(0.5)
+        site.waiting_replays[which, view.name] = view
         found = await site.work("replay", which, view.asked)
         done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
     except TdhilError as error:

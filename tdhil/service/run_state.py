@@ -34,8 +34,8 @@ class State(StrEnum):
     IDENTIFYING = "identifying"
     DONE = "done"
     REFUSED = "refused"                    # before motion, or by the sign probe or unit check
-    STOPPED = "stopped"                    # stopped on request, standstill confirmed
-    FAILED = "failed"                      # an error, standstill confirmed
+    STOPPED = "stopped"                    # stopped on request, also before motion: see `Stop.confirmed`
+    FAILED = "failed"                      # an error, also before motion: see `Stop.confirmed`
     STOP_NOT_CONFIRMED = "stop_not_confirmed"
     INTERRUPTED = "interrupted"            # the run's process was lost; the error states how the shaft ended
 
@@ -87,6 +87,7 @@ class Stop:
     """Progress of a stop: each time as ISO 8601 in UTC, None until it is reached.
 
     ``seen``: time at which the drive was in quick stop, or was commanded to zero speed.
+    ``confirmed``: whether standstill was confirmed; None if tdhil did not stop the drive.
     """
 
     asked: str | None = None
@@ -265,6 +266,7 @@ def iso(time_s: float) -> str:
 #     │   └── TooLarge                the uploaded file is larger than the limit                exit 2, HTTP 413
 #     ├── CommunicationLost
 #     │   ├── NotReacting             the run's process is suspended                            exit 5, HTTP 504
+#     │   ├── FolderMissing           the run's folder is missing; its process was signalled    exit 5, HTTP 503
 #     │   └── TooSlow                 an upload takes too long                                  exit 5, HTTP 408
 #     └── PreflightRefused
 #         └── Conflict                another run uses the rig; the code is void                exit 4, HTTP 409
@@ -357,6 +359,12 @@ class NotReacting(CommunicationLost):
     """The run's process is suspended and does not carry out the request."""
 
     entry = MessageCode.RUN_NOT_REACTING
+
+
+class FolderMissing(CommunicationLost):
+    """The run's folder is missing. SIGTERM was sent to its process."""
+
+    entry = MessageCode.SERVER_UNREACHABLE
 
 
 class TooLarge(UsageError):

@@ -140,15 +140,16 @@ class RigFileView:
 
 @dataclass(frozen=True)
 class ReplayView:
-    """A replay: its settings and its result."""
+    """A replay: its settings and its result. ``holder``: holds a drive, so the replay is delayed until it has ended."""
 
     name: str
     asked: dict[str, Any]
     at: str
     by: str
-    state: Literal["waiting", "done", "failed"]
+    state: Literal["waiting", "delayed", "done", "failed"]
     result: dict[str, Any] | None = None
     error: Told | None = None
+    holder: str | None = None
 
 
 @dataclass(frozen=True)
@@ -763,7 +764,7 @@ ROUTES: Final = (
     Route("POST", "/runs/{run}/acceptance", "sign_acceptance", "Sign the acceptance of a run, once", "engineer",
           {200: AcceptanceView}, SignatureBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result is kept", "operator",
-          {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422)),
+          {202: ReplayView, 200: ReplayView}, ReplayBody, (403, 404, 422, 503)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
     Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
           _file("application/octet-stream"), errors=(404,), headers=_RANGE),
@@ -776,7 +777,7 @@ ROUTES: Final = (
     Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
           _file("application/json"), errors=(404,), headers=_RANGE),
     Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made at the first request",
-          "viewer", _file("text/csv"), errors=(404, 422), headers=_RANGE),
+          "viewer", _file("text/csv"), errors=(404, 422, 507), headers=_RANGE),
     Route("POST", "/runs/{run}/evidence", "make_evidence", "Make the archive of a run, scrubbed, for others to check",
           "engineer", {201: EvidenceView}, EVIDENCE, (403, 404, 409, 422, 503)),
     Route("GET", "/runs/{run}/evidence.zip", "evidence", "The archive of evidence", "viewer",

@@ -209,7 +209,7 @@ def serve(
             sender.close()
         listening.close()
         alone.close()
-    left = sorted({*supervisor.live(), *supervisor.not_at_rest})
+    left = sorted({*supervisor.may_turn(), *supervisor.not_at_rest})
     if left:
         say(f"Standstill NOT confirmed: {', '.join(left)}. Use the hard-wired emergency stop.")
         return int(ExitCode.STOP_NOT_CONFIRMED)
@@ -301,9 +301,11 @@ def _ender(server: uvicorn.Server, brake: Callable[[str], bool], say: Say) -> Ca
     begun = threading.Event()
 
     def end() -> None:
-        if not brake("service ending"):
-            say("some runs have not ended in time")
-        server.should_exit = True
+        try:
+            if not brake("service ending"):
+                say("some runs have not ended in time")
+        finally:                               # a failed stop must not keep the service from ending
+            server.should_exit = True
 
     def handler(number: int, frame: Any) -> None:
         if not begun.is_set():

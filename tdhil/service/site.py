@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import sqlite3
 import threading
 from collections.abc import Callable, Coroutine, Iterable, Mapping
@@ -32,11 +33,11 @@ from tdhil.service.live_feed import Feeds
 from tdhil.service.records import RunRecords
 from tdhil.service.run_channel import lives
 from tdhil.service.run_filter import NEWEST, Order, RunFilter, Summary
-from tdhil.service.run_state import NotThere, State, Status
+from tdhil.service.run_state import NotThere, State, Status, Told
 from tdhil.service.schemas import ReplayView, RigView, RunsPageView, RunView, adapter
 from tdhil.service.start_request import RigFile
 from tdhil.service.store import CHOSEN, LOG, RECOVERED, read_as, read_json
-from tdhil.service.supervisor import Supervisor
+from tdhil.service.supervisor import Supervisor, service_ended
 from tdhil.service.uploads import TRACE, Uploads
 from tdhil.session import Holder
 
@@ -55,6 +56,8 @@ WHOLE_INDEX_S: Final = 30.0
 """Longest wait of a trend for an index that is being made, s: 10,000 runs take about 10 s. A list does not wait."""
 PAGE_RUNS: Final = 100
 """Number of runs on a page of the list."""
+BEGUN_BY: Final = "begun_by"
+"""Key of a waiting replay's file: the start of the service that accepted it."""
 TREND_RUNS: Final = 1000
 """Number of latest runs in a trend."""
 
@@ -102,6 +105,7 @@ class Site:
         self.logins = anyio.CapacityLimiter(1)         # limit of simultaneous password checks: each takes 32 MB
         self.waiting_replays: dict[tuple[str, str], ReplayView] = {}
         self.replay_names = threading.Lock()
+        self.start_id = secrets.token_hex(8)
         self.records = RunRecords(supervisor, lambda run: any(one == run for one, _ in tuple(self.waiting_replays)))
         self.tasks: set[asyncio.Task[Any]] = set()
         self._stops = ThreadPoolExecutor(STOPS, "stop")
@@ -295,10 +299,16 @@ class Site:
         return first, second
 
     def replays(self, run: str) -> list[ReplayView]:
-        """Return the finished replays and the waiting ones."""
-        made = {name: adapter(ReplayView).validate_python(one) for name, one in self.store.replays(run)}
-        waiting = {name: one for (at, name), one in tuple(self.waiting_replays.items())
-                   if at == run and name not in made}
+        """Return the finished replays and the waiting ones. One that waited when the service ended has failed."""
+        waiting = {name: one for (at, name), one in tuple(self.waiting_replays.items()) if at == run}
+        made = {}
+        for name, plain in self.store.replays(run):
+            here = plain.pop(BEGUN_BY, None) == self.start_id
+            one = made[name] = adapter(ReplayView).validate_python(plain)
+            if one.state != "waiting":
+                waiting.pop(name, None)
+            elif not here:
+                made[name] = replace(one, state="failed", error=Told.of(service_ended(f"replay {name}")))
         return [one for _, one in sorted((made | waiting).items())]
 
     def run_view(self, run: str, status: Status | None = None) -> RunView:

@@ -34,6 +34,7 @@ from tdhil.service.run_state import (
     FULL,
     MAY_TURN,
     Conflict,
+    FolderMissing,
     NoRoom,
     NotReacting,
     NotThere,
@@ -70,6 +71,8 @@ from tdhil.service.store import (
 )
 from tdhil.session import Holder, holder_of, holders
 
+KEPT_WORK: Final = "recover"
+"""Task that outlives the service: no page waits for it."""
 LOOK_S: Final = 0.2
 """Interval of the check whether a run is alive, s."""
 INDEX_LOOKS: Final = 10
@@ -131,6 +134,7 @@ class Supervisor:
         self._live: dict[str, str] = {}                # the rig of each, in the order of their start
         self._console = Console(store, say)
         self._lost: set[str] = set()
+        self._failures: dict[str, str] = {}            # the latest failure of each run's check
         self._stops: dict[str, tuple[str, str]] = {}   # (who, when) requested the stop of a suspended run
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop was not confirmed
         self._unindexed: set[str] = set()
@@ -139,6 +143,8 @@ class Supervisor:
         self.pace = RequestPace()
         self.not_at_rest: list[str] = []               # runs stopped by `brake`, standstill not confirmed
         self._end = threading.Event()
+        self._workers: set[subprocess.Popen[bytes]] = set()
+        self._working = threading.Lock()
         self._thread: threading.Thread | None = None
         self._begun: list[threading.Thread] = []
         self._notes = Jobs("audit", say)
@@ -163,8 +169,11 @@ class Supervisor:
         self._thread.start()
 
     def close(self) -> None:
-        """End the supervision. Runs continue."""
-        self._end.set()
+        """End the supervision and the computations of pages. Runs continue."""
+        with self._working:
+            self._end.set()
+            for worker in self._workers:
+                worker.terminate()
         if self._thread is not None:
             self._thread.join(5.0)
         for thread in self._begun:
@@ -173,34 +182,58 @@ class Supervisor:
         self._indexing.finish(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
-        """Refuse new runs, stop all runs, and wait until they have ended. Return whether they have.
+        """Refuse new runs, stop those that may turn a shaft, and wait for standstill. Return whether all are there.
 
-        `not_at_rest` lists the runs without a confirmed standstill, ended or not.
+        `not_at_rest` lists the runs without a confirmed standstill, ended or not. A run that is only identified
+        continues, since a stop does not shorten that.
         """
         with self._asking:             # a start in progress is finished first; then this run is stopped, too
             self._braking = True
-        stopping = self.live()
+        stopping = self.may_turn()
+        for run in self.live():
+            if run not in stopping and lives(self.store.runs / run):
+                self.say(f"run {run} is still being identified; it continues")
         for run in stopping:
-            with suppress(Exception):
+            try:
                 self.stop(run, who)
+            except (NotReacting, FolderMissing):       # its process was signalled
+                pass
+            except Exception as error:
+                self.say(f"run {run}: the stop failed ({error})")
+                self._terminate(run)
         if stopping:
             self.say(f"Stopping run {', '.join(stopping)}. tdhil waits {within_s:.0f} s at most for standstill."
                      " If a shaft keeps turning, use the hard-wired emergency stop.")
         end_s = time.monotonic() + within_s
-        while self.live() and time.monotonic() < end_s:
+        while not all(self._rests(run, recorded=True) for run in self.live()) and time.monotonic() < end_s:
             time.sleep(LOOK_S)
+        turning = self.may_turn()
         for run in stopping:
-            state = self.store.status(run).state
-            self.say(f"run {run}: {state}")
-            if run in self._live or state is State.STOP_NOT_CONFIRMED:
+            state = None               # unreadable: the shaft may turn
+            with suppress(Exception):
+                state = self.store.status(run).state
+            self.say(f"run {run}: {state or 'its state can not be read'}")
+            if run in turning or state in (None, State.STOP_NOT_CONFIRMED):
                 self.not_at_rest.append(run)
-        return not self.live()
+        return not turning
 
     # -- requests ------------------------------------------------------------------------------------------------
 
     def live(self) -> list[str]:
         """Return the runs that have not ended."""
         return list(self._live)
+
+    def may_turn(self) -> list[str]:
+        """Return the live runs whose shaft is not known to be at standstill."""
+        return [run for run in self.live() if not self._rests(run)]
+
+    def _rests(self, run: str, *, recorded: bool = False) -> bool:
+        """Return whether a live run confirmed standstill; with ``recorded``, whether its end is in its record, too."""
+        with suppress(Exception):              # an unreadable run may turn its shaft
+            status = self.store.status(run)
+            confirmed = status.stop.confirmed is True
+            return status.state is State.IDENTIFYING or (confirmed and (status.ended or not recorded))
+        return False
 
     def ahead_of_the_index(self) -> list[str]:
         """Return the runs whose index entry is missing or out of date."""
@@ -225,12 +258,27 @@ class Supervisor:
         return [one for _, one in sorted(found.items())]
 
     def run_of(self, rig_id: str) -> str | None:
-        """Return the present run of a rig."""
-        for run, rig in tuple(self._live.items()):
-            with suppress(NotThere):
-                if rig == rig_id and not self.store.status(run).ended:
+        """Return the present run of a rig; also one whose folder is missing, while its process runs."""
+        for run in [run for run, rig in tuple(self._live.items()) if rig == rig_id]:
+            try:
+                if not self.store.status(run).ended:
+                    return run
+            except NotThere:
+                if self._running(run) is not None:
                     return run
         return None
+
+    def _running(self, run: str) -> subprocess.Popen[bytes] | None:
+        """Return the process of a run that this service started; None if it has ended."""
+        child = self._children.get(run)
+        return child if child is not None and child.poll() is None else None
+
+    def _terminate(self, run: str) -> bool:
+        """Send SIGTERM to the run's process, which stops the shaft. Return whether it was sent."""
+        if (child := self._running(run)) is None:
+            return False
+        child.terminate()
+        return True
 
     def start_run(
         self, rig_id: str, asked: Mapping[str, Any], who: str, key: str | None = None, address: str = "",
@@ -369,8 +417,22 @@ class Supervisor:
 
         A suspended process (SIGSTOP, a debugger) can't stop the shaft, and must not continue later. It is killed, and
         its drive is stopped as for any run whose process was lost (decision 0022). Raises NotReacting then, NotThere,
-        and CommunicationLost if neither reached the run.
+        CommunicationLost if neither reached the run, and FolderMissing after SIGTERM without the run's folder.
         """
+        rig = self._live.get(run)
+        try:
+            return self._stop(run, who)
+        except NotThere:
+            if not self._terminate(run):
+                raise
+        self.note(who, "stop asked", run, rig, process="without folder")
+        raise FolderMissing(
+            page_text("the folder of the run is missing. SIGTERM was sent to its process, which stops the shaft."
+                      " Standstill can't be shown here"), where=f"run {run}",
+            next_step=page_text("Check that the shaft comes to standstill. If it turns, use the hard-wired emergency"
+                                " stop"))
+
+    def _stop(self, run: str, who: str) -> Status:
         folder = self.store.place(run)
         wish = {"do": "stop", "by": who}
         try:
@@ -379,6 +441,11 @@ class Supervisor:
             except (RunRefused, CommunicationLost):
                 if (status := self.store.status(run)).ended:
                     return status
+                if self._running(run) is None and not lives(folder):
+                    by, at = self._stops.setdefault(run, (who, now()))         # `_died` records it
+                    self.note(who, "stop asked", run, status.rig, process="lost")
+                    first = status.stop if status.stop.asked else replace(status.stop, asked=at, by=by)
+                    return replace(status, stop=first)
                 self._kill_frozen(status, who)
                 # The run's process may be starting. It reads this file once it listens, so one of both ways reaches it.
                 write_json(folder / STOP_FILE, {"by": who, "at": now()})
@@ -413,12 +480,14 @@ class Supervisor:
             next_step="Check that the shaft comes to standstill. If it turns, use the hard-wired emergency stop")
 
     def held_beside(self, run: str) -> Holder | None:
-        """Return the other program that holds the drive of a run whose motion is over. Raises NotThere.
+        """Return the other program that holds the drive of a run whose motion is over; None for a missing run.
 
         Such a run holds no drive itself, so a stop of the run does not reach the shaft.
         """
-        identifying = self.store.status(run).state is State.IDENTIFYING
-        return holder_of(self._address_of(run)) if identifying else None
+        with suppress(NotThere):
+            if self.store.status(run).state is State.IDENTIFYING:
+                return holder_of(self._address_of(run))
+        return None
 
     def stop_beside(self, run: str, holder: Holder, who: str) -> tuple[int, str]:
         """Run `tdhil stop` on the drive of a run that another program holds. Return the exit code and a text."""
@@ -561,14 +630,27 @@ class Supervisor:
                 try:
                     self._look_at(run)
                 except Exception as error:     # the check of one run failed: the others are still supervised
-                    self.say(f"run {run}: {type(error).__name__}: {error}")
+                    failure = f"run {run}: {type(error).__name__}: {error}"
+                    if self._failures.get(run) != failure:
+                        self._failures[run] = failure
+                        self.say(failure)
 
     def _look_at(self, run: str) -> None:
-        folder = self.store.place(run)
-        alive = lives(folder)
-        status = self.store.status(run)
+        try:
+            folder = self.store.place(run)
+            alive = self._running(run) is not None or lives(folder)
+            status = self.store.status(run)
+        except NotThere:
+            child = self._children.get(run)
+            if child is None or (code := child.poll()) is None:
+                raise LogError("its folder is missing, and its process may still run",
+                               next_step="Stop its rig: SIGTERM is sent to the process") from None
+            if run not in self._lost:
+                self._lost.add(run)
+                self._in_background(lambda: self._end_without_folder(run, code))
+            return
         if status.ended:
-            if alive and run in self._children and self._children[run].poll() is None:
+            if self._running(run) is not None:
                 return                         # the run has written its final status, and its process is about to end
             self._settle(run, status)
         elif not alive:
@@ -593,6 +675,20 @@ class Supervisor:
         self._console.forget(run)
         watched = {} if status.watch is None else {"watch": asdict(status.watch)}
         self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code, **watched)
+
+    def _end_without_folder(self, run: str, code: int) -> None:
+        """End a run whose folder is missing. Stop its drive if its process did not confirm standstill."""
+        rig = self._live[run]
+        try:
+            said = f"its folder is missing; its process ended with exit code {code}"
+            if code < 0 or code == ExitCode.STOP_NOT_CONFIRMED:
+                said = f"{said}; {self.stop_drive(self.rig(rig), 'service')[1]}"
+            self.say(f"run {run}: {said}")
+        finally:
+            self._children.pop(run, None)
+            self._live.pop(run, None)
+            self._console.forget(run)
+            self.note("service", "ended: its folder is missing", run, rig, exit_code=code)
 
     def _died(self, run: str, status: Status) -> Status:
         """Handle a run whose process is gone: stop its drive first, then save the status and recover the log."""
@@ -638,15 +734,28 @@ class Supervisor:
         self._index(run)
 
     def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Compute a task in its own process, at a lower priority than all runs. Raises Refused."""
+        """Compute a task in its own process, at a lower priority than all runs. Raises RunRefused, and Conflict if the
+        service ends.
+        """
         command = [sys.executable, "-m", "tdhil.service.worker", what]
         question = {"folder": None if run is None else str(self.store.place(run)), **asked}
-        done = subprocess.run(command, input=json.dumps(question).encode(), capture_output=True, check=False,
-                              start_new_session=True)
+        with self._working:
+            if self._end.is_set() and what != KEPT_WORK:
+                raise service_ended(what)
+            worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                                      start_new_session=True)
+            if what != KEPT_WORK:
+                self._workers.add(worker)
         try:
-            found: dict[str, Any] = json.loads(done.stdout)
+            reply, said = worker.communicate(json.dumps(question).encode())
+        finally:
+            self._workers.discard(worker)
+        try:
+            found: dict[str, Any] = json.loads(reply)
         except ValueError:
-            text = done.stderr.decode("utf-8", "replace").strip().splitlines()
+            if self._end.is_set():
+                raise service_ended(what) from None
+            text = said.decode("utf-8", "replace").strip().splitlines()
             found = {"error": Told("Error", "the work failed", text[-1] if text else "", what, "", 1,
                                    MessageCode.WORKER_PROCESS_LOST.code).__dict__}
         if found.get("error"):
@@ -711,13 +820,29 @@ class Supervisor:
         thread.start()
         self._begun = [one for one in self._begun if one.is_alive()] + [thread]
 
-    def turning(self) -> bool:
-        """Return whether a real shaft of this computer may turn: a run moves, or a drive is held."""
+    def turned_by(self) -> str | None:
+        """Return what may turn a real shaft of this computer: a run, or the holder of a drive; None without any."""
         for run in self.live():
             with suppress(Exception):
                 if not self.store.request(run).simulated and self.store.status(run).state in MAY_TURN:
-                    return True
-        return bool(holders())
+                    return f"run {run}"
+        return next((str(one) for one in holders()), None)
+
+    def turning(self) -> bool:
+        """Return whether a real shaft of this computer may turn: a run moves, or a drive is held."""
+        return self.turned_by() is not None
+
+    def refuse_turning(self, where: str) -> None:
+        """Raise Conflict while a real shaft of this computer may turn."""
+        if (holder := self.turned_by()) is not None:
+            raise Conflict(f"a drive on this computer is held by {holder}, so a shaft may turn", where=where,
+                           holder=holder, next_step="Nothing was done, since it could disturb the bus or the"
+                           " control loop of that drive. Repeat the request when the drive is free")
+
+
+def service_ended(where: str) -> Conflict:
+    """Return the refusal of a task that the service began, and did not finish before its own end."""
+    return Conflict("the service ended before this was done", where=where, next_step="Repeat it")
 
 
 def _tdhil_stop(rig_file: Path) -> list[str]:

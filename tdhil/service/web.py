@@ -245,6 +245,8 @@ class Web(Site):
     def _running(self, rig: str) -> Running | None:
         if (run := self.supervisor.run_of(rig)) is None:
             return None
-        asked, status = self.store.request(run), self.store.status(run)
-        simulated = asked.simulated if status.simulated is None else status.simulated
-        return Running(run, self.store.place(run) / LOG, simulated, asked.rehearsal)
+        with suppress(NotThere):
+            asked, status = self.store.request(run), self.store.status(run)
+            simulated = asked.simulated if status.simulated is None else status.simulated
+            return Running(run, self.store.place(run) / LOG, simulated, asked.rehearsal)
+        return None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -99,12 +99,15 @@ def _signed(document: dict[str, Any]) -> dict[str, Any]:
 
 def samples(asked: dict[str, Any]) -> dict[str, Any]:
     """Write the run's samples as samples.csv, as `tdhil export` does."""
+    from tdhil.errors import LogError
+    from tdhil.recording import read_run, write_samples
+
     os.chdir(asked["folder"])
-    with _put("samples.csv") as beside:
-        command = [sys.executable, "-m", "tdhil", "export", LOG, "--to", "csv", "-o", str(beside)]
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-        if not beside.exists():
-            raise UsageError(" ".join(done.stderr.split())[:500] or "can't be exported", where=LOG)
+    try:
+        with _put("samples.csv") as beside:
+            write_samples(Path(LOG), beside, int(read_run(Path(LOG)).recording.simulated))
+    except LogError as error:
+        raise UsageError(error.what, where=error.where, next_step=error.next_step) from error
     return {"document": {"file": "samples.csv"}}
 
 
@@ -209,6 +212,7 @@ def main(arguments: list[str]) -> int:
     """Compute one task. Return 0; the reply on stdout contains the result or the error."""
     with suppress(OSError, AttributeError):
         os.nice(NICE.get(arguments[0], USUAL_NICE))
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))      # unfinished files are removed
     with suppress(OSError):                    # without memory, the system ends this process first
         Path("/proc/self/oom_score_adj").write_text("500")
     out = os.fdopen(os.dup(1), "w")

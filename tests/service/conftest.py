@@ -24,7 +24,7 @@ from tdhil.service.access import Access
 from tdhil.service.audit import Audit
 from tdhil.service.limits import API
 from tdhil.service.run_channel import RunRefused
-from tdhil.service.run_state import Told
+from tdhil.service.run_state import Told, disk_full
 from tdhil.service.start_request import Rigs
 from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor
@@ -94,8 +94,8 @@ def play_uploads(service: Service, monkeypatch: pytest.MonkeyPatch, *, played: b
         with _CWD:
             try:
                 return WORK[what](asked if run is None else {"folder": str(service.store.place(run)), **asked})
-            except TdhilError as error:
-                raise RunRefused(Told.of(error)) from error
+            except (TdhilError, OSError) as error:
+                raise RunRefused(Told.of(disk_full(error) or error)) from error
             finally:
                 os.chdir(before)
 

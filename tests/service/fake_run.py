@@ -44,7 +44,8 @@ def main(folder: Path) -> None:
         elif asked.get("do") == "stop":
             stop.asked = True
             at = now()
-            board.know(stop=Stop(asked=at, by=asked["by"], seen=at))
+            if board.status.stop.at_rest is None:
+                board.know(stop=Stop(asked=at, by=asked["by"], seen=at))
         elif asked.get("do") == "confirm":
             confirming.take(asked["code"], asked["binding"], asked["by"], asked.get("lease") or "")
         elif asked.get("do") == "lease":
@@ -101,11 +102,14 @@ def main(folder: Path) -> None:
                 time.sleep(0.01)
         if what == "identify":
             board.to(State.STOPPING)
+            board.stop(confirmed=True, at_rest=now())
             board.to(State.IDENTIFYING)
             while not stop.asked:
                 time.sleep(0.01)
             end(board, State.FAILED, 143)
         elif stop.asked and what != "loose":
+            if (folder / "run.mcap").exists():         # it moved
+                board.stop(confirmed=True, at_rest=now())
             end(board, State.STOPPED, 143)
         elif what in ("unseen", "loose"):
             end(board, State.STOP_NOT_CONFIRMED, 8)

@@ -621,7 +621,7 @@ def test_it_is_reached_by_its_own_host_names(client, host):
 
 
 @pytest.mark.parametrize("headers", [
-    {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
+    {"Origin": "http://evil.example"}, {"Origin": "http://["}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
     {"Origin": "file://127.0.0.1:8420"}, {"Sec-Fetch-Site": "cross-site"}, {"Sec-Fetch-Site": "same-site"},
 ])
 def test_a_page_of_another_site_moves_and_stops_nothing(client, service, headers):

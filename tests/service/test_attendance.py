@@ -368,3 +368,15 @@ def test_a_second_stop_keeps_the_time_of_the_first(board, monkeypatch):
     watcher.asked_to_stop("second")
     watcher.cycle(COMMAND, braking)
     assert board.status.stop == first
+
+
+def test_a_stop_after_standstill_is_not_recorded_as_its_cause(board):
+    """The page showed a standstill that was earlier than its request."""
+    watcher = Watcher(board)
+    for state in (State.PREFLIGHT, State.MOVING):
+        board.to(state)
+    watcher.stopped(confirmed=True)
+    board.to(State.IDENTIFYING)
+    watcher.asked_to_stop("anna")
+    assert (board.status.stop.asked, board.status.stop.by) == (None, None)
+    assert board.status.stop.at_rest is not None

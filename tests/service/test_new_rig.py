@@ -210,8 +210,9 @@ def test_a_scan_asks_first_and_shows_what_replied(call, service, monkeypatch):
         "found": [{"address": 3, "title": "EPOS4", "identity": "", "simulated": False, "profile": None, "why": "",
                    "fields": {"node": "3"}}], "remarks": []}))})
     assert call("POST", "/new-rig/scan", 200, json=body | {"alone": True})["found"][0]["fields"] == {"node": "3"}
-    monkeypatch.setattr(service.supervisor, "turning", lambda: True)
-    assert "shaft is turning" in call("POST", "/new-rig/scan", 409, json=body | {"alone": True})["error"]["message"]
+    monkeypatch.setattr(service.supervisor, "turned_by", lambda: "process 7 (x)")
+    refused = call("POST", "/new-rig/scan", 409, json=body | {"alone": True})
+    assert "held by process 7 (x), so a shaft may turn" in refused["error"]["message"]
 
 
 def test_the_scan_is_that_of_the_command_line(monkeypatch):
@@ -244,8 +245,9 @@ def test_a_rig_is_checked_without_motion(call, service):
 def test_no_rig_is_checked_while_a_real_shaft_may_turn(call, service, monkeypatch):
     rig = call("GET", "/rigs", 200)[0]["id"]
     monkeypatch.setattr(service.supervisor, "work", lambda *asked: pytest.fail("nothing is opened"))
-    monkeypatch.setattr(service.supervisor, "turning", lambda: True)
-    assert "shaft is turning" in call("POST", f"/rigs/{rig}/check", 409, json={})["error"]["message"]
+    monkeypatch.setattr(service.supervisor, "turned_by", lambda: "process 7 (x)")
+    refused = call("POST", f"/rigs/{rig}/check", 409, json={})
+    assert "held by process 7 (x), so a shaft may turn" in refused["error"]["message"]
 
 
 def test_the_check_is_that_of_the_command_line(monkeypatch, tmp_path):

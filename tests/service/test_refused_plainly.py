@@ -57,7 +57,8 @@ def test_the_idle_state_of_the_service_is_reported_despite_a_damaged_run(call, s
     assert f"run {name} used a drive" in said[-1]
 
 
-@pytest.mark.parametrize("path", ["/runs?limit={}", "/audit?limit={}", "/runs?limit=0", "/audit?limit=5001"])
+@pytest.mark.parametrize("path", ["/runs?limit={}", "/audit?limit={}", "/runs/page?page={}", "/runs?limit=0",
+                                  "/audit?limit=5001"])
 def test_a_number_of_5000_digits_is_refused(client, path):
     assert client.get(API + path.format("9" * 5000)).status_code == 422
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import os
@@ -15,6 +16,7 @@ import pytest
 
 from profiles import STAGE_NUMBERS
 from tdhil.buses import all_buses
+from tdhil.errors import UsageError
 from tdhil.service import fleets as fleets_module
 from tdhil.service import worker
 from tdhil.service.fleets import Fleets
@@ -23,7 +25,7 @@ from tdhil.service.start_request import Rigs
 from tdhil.service.store import read_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
-from tests.service.conftest import HANGS_S, wait_for
+from tests.service.conftest import HANGS_S, Service, play_uploads, wait_for
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -62,6 +64,30 @@ def test_samples_are_a_table(call, service, tmp_path, monkeypatch):
     assert call("GET", f"/runs/{run}/samples.csv", 200).text.startswith("time_s,")
 
 
+def test_a_full_disk_is_reported_as_such_while_samples_are_written(call, service, tmp_path, monkeypatch):
+    """It gave HTTP 422 with the text of another program."""
+    run = call.start()["id"]
+    service.wait(run, "done")
+    write(service.store.place(run) / "run.mcap")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(csv, "writer", full)
+    play_uploads(service, monkeypatch)
+    found = call("GET", f"/runs/{run}/samples.csv", 507)["error"]
+    assert (found["what"], found["next_step"]) == ("the disk is full (No space left on device)",
+                                                   "Free some disk space, then repeat the request")
+    assert not list(service.store.place(run).glob("*samples.csv"))
+
+
+def test_samples_of_a_file_that_is_no_log_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.mcap").write_bytes(b"no log")
+    with pytest.raises(UsageError):
+        worker.samples({"folder": str(tmp_path)})
+
+
 def test_possible_rehearsals_are_accepted_at_every_stage(call):
     for bus in all_buses():
         faults = bus.faults()
@@ -85,6 +111,37 @@ def test_the_example_rigs_are_simulated():
 def test_a_drive_in_use_may_turn(service):
     with hold("a drive of this test"):
         assert service.supervisor.turning()
+        assert service.supervisor.turned_by().startswith(f"process {os.getpid()} (")
+
+
+def test_a_replay_states_for_which_drive_it_waits(call, service, monkeypatch):
+    """The page showed "Identifying again" with a progress bar, although nothing was computed."""
+    run = call.start("a", "done")["id"]
+    service.wait(run, "done")
+    monkeypatch.setattr(service.supervisor, "work", lambda *asked: {"document": {"verdict": "valid"}})
+    with hold("a drive of this test"):
+        call("POST", f"/runs/{run}/replays", 202, json={"model": "rigid"})
+        found = wait_for("its delay", lambda: next(
+            (one for one in call("GET", f"/runs/{run}", 200)["replays"] if one["state"] == "delayed"), None))
+        assert found["holder"].startswith(f"process {os.getpid()} (")
+    wait_for("its end", lambda: call("GET", f"/runs/{run}/replays/001", 200)["state"] == "done")
+    assert call("GET", f"/runs/{run}", 200)["replays"][0]["holder"] is None
+
+
+def test_a_replay_that_the_end_of_the_service_interrupted_has_failed(call, service, tmp_path, monkeypatch):
+    """It was accepted, and then lost without a trace."""
+    run = call.start("a", "done")["id"]
+    service.wait(run, "done")
+    goes_on = threading.Event()
+    monkeypatch.setattr(service.supervisor, "work", lambda *asked: goes_on.wait(HANGS_S) and {"document": {}})
+    call("POST", f"/runs/{run}/replays", 202, json={"model": "rigid"})
+    assert [one.state for one in service.web.replays(run)] == ["waiting"]
+    after = Service(tmp_path / "data", None)
+    (found,) = after.web.replays(run)
+    assert (found.state, found.asked) == ("failed", {"model": "rigid"})
+    assert (found.error.what, found.error.next_step) == ("the service ended before this was done", "Repeat it")
+    goes_on.set()
+    wait_for("its end", lambda: [one.state for one in service.web.replays(run)] == ["done"])
 
 
 @pytest.fixture
@@ -258,3 +315,24 @@ def test_the_worker_calibrates_as_the_command_does(tmp_path, monkeypatch):
     factor = found["calibration_factor"]
     assert factor["low"] <= 1.0 / bodies.SCALE <= factor["high"]
     assert any("standard uncertainty of the body" in warning for warning in found["warnings"])
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("log.mcap", "The run ended without a log"), ("result.json", "The run ended without a result"),
+    ("report.pdf", "The run ended without a report"), ("samples.csv", "The run ended without a log"),
+    ("trace.csv", "Only a run from an uploaded trace has this file"),
+    ("evidence.zip", "Make the evidence first"),
+])
+def test_a_file_of_an_ended_run_is_not_waited_for(call, service, name, text):
+    run = call.start("a", "unseen")["id"]
+    service.wait(run, "stop_not_confirmed")
+    (service.store.place(run) / "run.mcap").unlink(missing_ok=True)
+    assert call("GET", f"/runs/{run}/{name}", 404)["error"]["next_step"] == text
+    assert call("POST", f"/runs/{run}/replays", 422, json={})["error"]["next_step"] == "The run ended without a log"
+
+
+def test_a_file_of_a_live_run_is_waited_for(call, service):
+    run = call.start("a", "hold")["id"]
+    service.wait(run, "moving")
+    for name in ("result.json", "evidence.zip"):
+        assert call("GET", f"/runs/{run}/{name}", 404)["error"]["next_step"] == "Wait until the run has ended"

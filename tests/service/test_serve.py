@@ -25,8 +25,10 @@ from tdhil.errors import ExitCode, UsageError
 from tdhil.recording import read_run
 from tdhil.service import AccountsFile, attend, server
 from tdhil.service.client import ServiceError
+from tdhil.service.run_state import State, now, way_to
 from tdhil.service.server import require_way
-from tdhil.service.store import Store
+from tdhil.service.store import Store, StoredRequest
+from tests.recording.test_log_tail import write
 from tests.rigs import PATIENT_LIMITS, rig_file
 from tests.service.conftest import HANGS_S, folder_of_locks, wait_for
 
@@ -126,6 +128,26 @@ def test_a_run_outlives_its_web_and_gives_one_result(tmp_path):
         assert second.client.run(run)["result"] == found["result"]
     one = json.loads((folder / "result.json").read_bytes())
     assert one == found["result"]
+
+
+@pytest.mark.heavy
+def test_the_end_of_the_service_interrupts_a_replay_and_keeps_its_request(tmp_path):
+    """The process hung after SIGTERM, and the accepted replay was lost."""
+    store, data = Store(tmp_path / "data"), tmp_path / "data"
+    store.prepare()
+    run = store.new_id()
+    status = store.begin(StoredRequest(run, "simulated-canopen", "", "", {}, "local", now(), True, "never"))
+    store.save(way_to(status.to(State.PREFLIGHT, now()).to(State.MOVING, now()), State.STOPPED, now(), exit_code=143))
+    write(store.place(run) / "run.mcap")
+    with served(data) as first:
+        first.client._object("POST", f"/runs/{run}/replays", {})
+        first.process.send_signal(signal.SIGTERM)
+        assert first.process.wait(HANGS_S) == ExitCode.OK
+    with served(data) as second:
+        (found,) = second.client.run(run)["replays"]
+        assert found["state"] in ("failed", "done")
+        if found["result"] is None:
+            assert found["error"]["next_step"]
 
 
 @pytest.mark.heavy

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,6 +95,7 @@ def test_a_service_that_brakes_starts_no_more_runs(service):
     assert {service.store.status(one).stop.by for one in (loose, run)} == {"the end"}
     with pytest.raises(Conflict, match="service is ending"):
         begun(service, "hold", "b")
+    wait_for("their end", lambda: not service.supervisor.live())
     service.said.clear()
     assert service.supervisor.brake("again")
     assert service.said == []                                              # no motion, no message
@@ -109,6 +111,16 @@ def test_after_its_time_out_a_service_reports_live_runs(service):
     assert service.said[-1] == f"run {run}: moving"
     os.kill(service.store.status(run).pid, signal.SIGKILL)
     service.wait(run, "interrupted")
+
+
+def test_a_run_that_is_identified_is_not_waited_for(service):
+    """Its standstill was reported as not confirmed, with exit code 8, although it was in its record."""
+    service.supervisor.start()
+    run = begun(service, "identify", "a", "identifying")
+    assert service.supervisor.brake("the end")
+    assert (service.supervisor.not_at_rest, service.supervisor.may_turn()) == ([], [])
+    assert service.said == [f"run {run} is still being identified; it continues"]
+    assert service.store.status(run).state is State.IDENTIFYING
 
 
 def test_a_key_gives_its_run_for_the_same_request_of_the_same_user_and_rig(service):
@@ -175,12 +187,14 @@ def test_a_stop_without_a_recipient_is_reported(service, monkeypatch, dies):
         patched.setattr(supervisor_module, "send_signal", lambda pid, folder, number: sent.append(number) or False)
         if dies:
             patched.setattr(supervisor_module, "lives", lambda folder: False)
-            assert service.supervisor.stop(run, "anna").state is State.MOVING
+            patched.setattr(service.supervisor, "_running", lambda run: None)
+            found = service.supervisor.stop(run, "anna")
+            assert (found.state, found.stop.by, found.stop.asked is not None) == (State.MOVING, "anna", True)
         else:
             with pytest.raises(CommunicationLost, match="nobody answers") as lost:
                 service.supervisor.stop(run, "anna")
             assert "hard-wired emergency stop" in lost.value.next_step
-        assert sent == [signal.SIGTERM]
+        assert sent == ([] if dies else [signal.SIGTERM])
     service.supervisor.stop(run, "anna")
     service.wait(run, "stopped")
 
@@ -292,6 +306,25 @@ def test_a_lost_process_is_handled_once_and_the_others_as_usual(service, monkeyp
     assert all(child.poll() is not None for child in service.supervisor._children.values())
 
 
+def test_a_stop_just_after_the_loss_of_the_process_is_in_the_record(service, monkeypatch):
+    """The service stopped the drive already, and the page said that the stop was not delivered."""
+    monkeypatch.setattr(service.supervisor, "_look", lambda: None)     # the loss is not seen yet
+    service.supervisor.start()
+    run = begun(service)
+    child = service.supervisor._children[run]
+    child.kill()
+    child.wait()
+    found = service.supervisor.stop(run, "anna")
+    assert (found.state, found.stop.by) == (State.MOVING, "anna")
+    service.supervisor.stop(run, "berta")
+    service.supervisor._look_at(run)
+    service.wait(run, "interrupted")
+    status = service.store.status(run)
+    assert (status.stop.by, status.stop.asked) == ("anna", found.stop.asked)
+    wait_for("its end", lambda: not service.supervisor.live())
+    assert not (service.store.place(run) / STOP_FILE).exists()
+
+
 def test_a_failure_of_one_run_does_not_affect_the_others(service, monkeypatch):
     service.supervisor.start()
     run, other = begun(service), begun(service, "hold", "b")
@@ -329,13 +362,40 @@ def test_a_failed_computation_gives_the_reason(service, monkeypatch):
     with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
     assert refused.value.reported.exit_code != 0
-    broken = SimpleNamespace(stdout=b"is not JSON", stderr=b"first\nkilled\n")
-    monkeypatch.setattr(supervisor_module.subprocess, "run", lambda *_, **__: broken)
+    replies = [(b"is not JSON", b"first\nkilled\n"), (b"is not JSON", b"")]
+
+    class Broken:
+        def __init__(self, *_: Any, **__: Any) -> None:
+            pass
+
+        def communicate(self, question: bytes) -> tuple[bytes, bytes]:
+            return replies.pop(0)
+
+    monkeypatch.setattr(supervisor_module.subprocess, "Popen", Broken)
     with pytest.raises(RunRefused) as refused:
         service.supervisor.work("plan", None, {})
     assert (refused.value.reported.message, refused.value.reported.what) == ("the work failed", "killed")
-    broken.stderr = b""
     with pytest.raises(RunRefused):
+        service.supervisor.work("plan", None, {})
+
+
+def test_the_end_of_the_service_ends_a_computation(service, monkeypatch):
+    """It waited for it, without a message, and its result was lost."""
+    begun, real = [], subprocess.Popen
+
+    def slow(command: list[str], **more: Any) -> Any:
+        begun.append(real([sys.executable, "-c", "import sys, time; sys.stdin.read(); time.sleep(3600)"], **more))
+        return begun[0]
+
+    monkeypatch.setattr(supervisor_module.subprocess, "Popen", slow)
+    with ThreadPoolExecutor(1) as thread:
+        work = thread.submit(service.supervisor.work, "replay", None, {})
+        wait_for("the process", lambda: service.supervisor._workers)
+        service.supervisor.close()
+        with pytest.raises(Conflict, match="the service ended before this was done"):
+            work.result()
+    assert begun[0].wait(60.0) == -signal.SIGTERM
+    with pytest.raises(Conflict, match="the service ended"):
         service.supervisor.work("plan", None, {})
 
 

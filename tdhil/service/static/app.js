@@ -10,9 +10,16 @@
   const STATES = {
     requested: tr("requested"), preflight: tr("preflight"), awaiting_confirmation: tr("waiting for the code"),
     moving: tr("moving"), stopping: tr("stopping"), identifying: tr("identifying"), done: tr("done"), refused: tr("refused"),
-    stopped: tr("stopped, at standstill"), failed: tr("failed, at standstill"), stop_not_confirmed: tr("STOP NOT CONFIRMED"),
+    stopped: tr("stopped"), failed: tr("failed"), stop_not_confirmed: tr("STOP NOT CONFIRMED"),
     interrupted: tr("interrupted"),
   };
+  /** The state of a run, with what is known of its standstill. A list does not know it. */
+  function stateText(state, stop, history) {
+    if (state !== "stopped" && state !== "failed") return STATES[state] || state;
+    if (stop.confirmed) return state === "stopped" ? tr("stopped, at standstill") : tr("failed, at standstill");
+    if (history.some((one) => one.state === "moving")) return STATES[state];
+    return state === "stopped" ? tr("stopped before motion") : tr("failed before motion");
+  }
   const OLD = tr("No connection to tdhil serve: the values are old, and Stop on this page may not arrive. A shaft may still turn. To stop it, use the hard-wired emergency stop.");
   const byId = (id) => document.getElementById(id);
 
@@ -612,7 +619,7 @@
   function livePage() {
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
-    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
+    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null, tooLate = false;
     let wentOn = false;                                // true if the page was opened for the run, not for its record
     try { wentOn = sessionStorage.getItem(STARTED) === run; } catch (error) { /* then a run that ended at once is not followed */ }
     const charts = window.tdhil.motion(run);
@@ -695,7 +702,7 @@
 
     function state() {
       const error = status.error ? `: ${errorText(status.error)}` : "";
-      byId("state").textContent = `${STATES[status.state] || status.state}${status.stage ? `: ${word(status.stage, "stage")}` : ""}${error}`;
+      byId("state").textContent = `${stateText(status.state, status.stop, status.history)}${status.stage ? `: ${word(status.stage, "stage")}` : ""}${error}`;
       byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
       const over = ENDED.includes(status.state);
       if (!over) wentOn = true;
@@ -742,13 +749,14 @@
     }
 
     function stopTimes() {
-      show(byId("stop-times"), ...stopSteps((status && status.stop) || {}, Boolean(asking)));
+      const stop = (status && status.stop) || {}, late = tooLate && stop.at_rest && !stop.asked;
+      show(byId("stop-times"), ...stopSteps(stop, Boolean(asking)), late ? el("li", {}, tr("The shaft has been at standstill since {time}.", { time: clock(stop.at_rest) })) : null);
     }
 
     /** The stop is not acknowledged; or the run acknowledged it, and its drive does not react. */
     function stopAlarm() {
       const stop = (status && status.stop) || {}, over = status && ENDED.includes(status.state);
-      if (stop.asked || over) undelivered = false;
+      if (stop.asked || stop.at_rest || over) undelivered = false;
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
       if (saidOfRig) return;                  // the result of a stop after the run stays
@@ -773,7 +781,8 @@
       const late = setTimeout(() => { undelivered = true; stopAlarm(); }, SILENT_MS);
       try {
         const found = await call("POST", `/runs/${run}/stop`, {}, {}, 10000);
-        if (found.stop.asked || found.state === "requested" || ENDED.includes(found.state)) {
+        tooLate = Boolean(found.stop.at_rest && !found.stop.asked);
+        if (found.stop.asked || tooLate || found.state === "requested" || ENDED.includes(found.state)) {
           clearTimeout(late);
           undelivered = false;
         }
@@ -976,7 +985,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, shareOf, show, span, speedUnit, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, shareOf, show, span, speedUnit, stateText, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

@@ -2,13 +2,13 @@
 "use strict";
 (() => {
   const { byLabels, coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, shareOf, show, span, speedUnit, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, shareOf, show, span, speedUnit, stateText, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
   function resultOf(run) {
     const result = run.result;
-    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
+    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, stateText(run.state, run.stop, run.history)))];
     if (run.error) parts.push(el("p", { class: wanted(run) ? "dim" : "alarm" }, errorText(run.error)));
     if (run.watch && run.watch.lost) parts.push(el("p", { class: "alarm" }, unwatched(run.watch)));
     const steps = stopSteps(run.stop);
@@ -138,7 +138,7 @@
       const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
       show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
         el("th", { scope: "row" }, one.first ? tr("the run itself") : english(Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ")) || tr("as the run")),
-        el("td", {}, one.state === "waiting" ? waits(one) : one.error ? errorText(one.error) : word(one.result.verdict, "verdict")),
+        el("td", {}, one.state === "delayed" ? delayed(one) : one.state === "waiting" ? waits(one) : one.error ? errorText(one.error) : word(one.result.verdict, "verdict")),
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? shareOf(one.result.inertia_kg_m2.value, one.result.inertia_kg_m2.low_total, one.result.inertia_kg_m2.high_total) : ""))));
     });
@@ -151,12 +151,17 @@
       byId("newer").hidden = false;
       return undefined;
     }
-    const clocks = new Map();
+    const clocks = new Map(), held = new Set();
+    /** The reason why a replay has not begun. */
+    function delayed(one) {
+      held.add(one.name);
+      return tr("waits until {holder} has ended", { holder: one.holder });
+    }
     /** The cell of a replay that goes on: since when, and its usual time. It stays the same element. */
     function waits(one) {
       if (!clocks.has(one.name)) {
         const cell = el("div");
-        waiting(cell, tr("Identifying again"), "replay", Date.parse(one.at));
+        waiting(cell, tr("Identifying again"), "replay", held.has(one.name) ? Date.now() : Date.parse(one.at));
         clocks.set(one.name, cell);
       }
       return clocks.get(one.name);

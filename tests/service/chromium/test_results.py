@@ -16,7 +16,8 @@ import pytest
 
 from tdhil.errors import UsageError
 from tdhil.service.run_channel import RunRefused
-from tdhil.service.run_state import Told
+from tdhil.service.run_state import Told, now
+from tdhil.service.schemas import ReplayView
 from tdhil.service.store import write_json
 from tests.recording.test_log_tail import write
 from tests.service.chromium.pages import HOSTILE, IN_CHROMIUM, TRACE, begin, estimate, results
@@ -130,6 +131,18 @@ def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatc
     with page.expect_download() as got:
         page.get_by_role("link", name="report.pdf").click()
     assert Path(got.value.path()).read_text() == "<h1>with its order</h1>" and made == ["report.html", "report.pdf"]
+
+
+def test_a_delayed_replay_shows_what_it_waits_for(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    served.service.web.waiting_replays[run, "001"] = ReplayView("001", {}, now(), "local", "delayed", holder="run X")
+    page.goto(f"/runs/{run}")
+    row = page.locator("#replay-rows tr", has_text="waits until run X has ended")
+    row.wait_for()
+    assert row.get_by_role("progressbar").count() == 0
+    served.service.web.waiting_replays[run, "001"] = ReplayView("001", {}, now(), "local", "waiting")
+    page.locator("#replay-rows").get_by_text("Identifying again: ").wait_for()
 
 
 def test_a_rehearsal_shows_the_required_and_observed_reaction_and_its_verdict(page, served):
@@ -427,7 +440,7 @@ def test_a_stopped_run_is_compared_and_each_verdict_has_its_colour(page, served,
         served.service.supervisor.index.put(served.service.store.summary(run))
     page.goto("/runs")
     rows = {run: page.locator("#runs tr", has=page.locator(f"a[href='/runs/{run}']")) for run in runs}
-    rows[runs[0]].get_by_text("stopped, at standstill").wait_for()
+    rows[runs[0]].get_by_text("stopped", exact=True).wait_for()      # a list does not know of standstill
     colours = [rows[run].locator(".verdict:not(.acceptance)").evaluate("one => getComputedStyle(one).color")
                for run in runs]
     assert len({*colours, page.evaluate("getComputedStyle(document.body).color")}) == 4

@@ -112,7 +112,7 @@ def test_a_result_of_a_simulated_drive_is_marked_on_the_card_of_a_real_rig(page)
     page.route("**/api/v1/rigs", lambda route: route.fulfill(json=[rig]))
     page.goto("/")
     card = page.get_by_role("article", name="Rig a")
-    card.get_by_text("failed, at standstill").wait_for()
+    card.get_by_text("· failed").wait_for()
     assert card.get_by_text("SIMULATED").count() == 1
 
 

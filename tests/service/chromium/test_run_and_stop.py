@@ -6,11 +6,13 @@ import json
 import os
 import re
 import signal
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from tdhil.service.store import write_json
+from tdhil.service.run_state import State, Stop, now, way_to
+from tdhil.service.store import StoredRequest, write_json
 from tdhil.session import hold
 from tests.recording.test_log_tail import write
 from tests.service.chromium.pages import IN_CHROMIUM, Served, begin, judge, results
@@ -116,6 +118,36 @@ def test_a_stop_shows_the_times_of_request_receipt_and_standstill(page, served):
     page.get_by_text("stopped, at standstill").wait_for()
     page.locator("li", has_text="stop requested ").wait_for()          # the page of the result shows the request
     assert not page.get_by_text("NOT DELIVERED").is_visible()
+
+
+@pytest.mark.parametrize(("state", "moved", "confirmed", "text"), [
+    ("stopped", False, None, "stopped before motion"), ("failed", False, None, "failed before motion"),
+    ("failed", True, None, "failed"), ("failed", True, True, "failed, at standstill"),
+])
+def test_only_a_confirmed_standstill_is_shown(page, served, state, moved, confirmed, text):
+    """A drive that tdhil never contacted was shown as "at standstill"."""
+    store = served.service.store
+    run = store.new_id()
+    status = store.begin(StoredRequest(run, "a", "a.yaml", "0" * 64, {}, "anna", now(), True, "never"))
+    status = status.to(State.PREFLIGHT, now())
+    if moved:
+        status = status.to(State.MOVING, now())
+    store.save(replace(way_to(status, State(state), now(), exit_code=5), stop=Stop(confirmed=confirmed)))
+    page.goto(f"/runs/{run}")
+    page.locator("#result .now", has_text=state).wait_for()
+    assert page.locator("#result .now").inner_text() == text
+
+
+def test_a_stop_after_standstill_is_not_shown_as_its_cause(page, served):
+    run = served.service.supervisor.start_run("a", {"note": "identify"}, "local").request.id
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text="identifying").wait_for()
+    page.route("**/stop", lambda route: route.fulfill(json={**served.service.store.status(run).plain()}))
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.get_by_text("The shaft has been at standstill since").wait_for()
+    page.wait_for_timeout(2500)
+    assert not page.get_by_text("stop requested").is_visible() and not page.get_by_text("NOT DELIVERED").is_visible()
+    served.service.supervisor.stop(run, "local")
 
 
 def test_a_late_reply_does_not_revert_a_newer_one(page, served):
