@@ -159,11 +159,11 @@ def syntax_error(error: yaml.MarkedYAMLError, text: str) -> tuple[int, str]:
 
 def _no_colon(line: str) -> str:
     """Return the problem of a line whose key has no ': ' behind it; '' for any other line."""
-    line = line.split(" #")[0].rstrip()
+    line = line.split(" #", maxsplit=1)[0].rstrip()
     if ": " in line or line.endswith(":") or not (found := _WITHOUT_COLON.fullmatch(line)):
         return ""
-    return (f"'{_short(line.strip())}' has no ': ' after the key. Write {_short(f'{found[2]}: {found[3] or chr(8230)}')},"
-            " with a space after the colon")
+    mended = _short(f"{found[2]}: {found[3] or '…'}")
+    return f"'{_short(line.strip())}' has no ': ' after the key. Write {mended}, with a space after the colon"
 
 
 def _indent(line: str) -> int:

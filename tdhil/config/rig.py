@@ -44,6 +44,7 @@ from profiles import (
 from tdhil.config.acceptance import ACCEPTED_QUANTITIES, Expectation
 from tdhil.config.options import CLOCKS, OPTIONS, Option, Topic
 from tdhil.config.registry import BUSES, RegistryEntry, imported, names
+from tdhil.file_kind import LOG, PAGE, PDF, RESULT, kind_of
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
@@ -377,6 +378,8 @@ def _with_sections(buses: tuple[tuple[str, RegistryEntry], ...]) -> type[Rig]:
 
 def load_rig(path: Path) -> Rig:
     """Return the bench of a rig.yaml, in SI. Raises DataFileError with every problem and its line."""
+    if (kind := kind_of(path)) in (LOG, RESULT, PAGE, PDF):
+        raise DataFileError((Problem(str(path), 0, f"is {kind}. --rig needs rig.yaml"),))
     return _rig_of(load_with_lines(path, rig_model(), convert=True))
 
 
