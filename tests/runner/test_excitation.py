@@ -131,7 +131,7 @@ def test_refuses_by_name(wish, word):
 
 
 @pytest.mark.parametrize(("wish", "words", "advice"), [
-    (PlanRequest(amplitude_rad_s=15.0), "speed window (lower end): an amplitude of 15 rad/s (143 rpm) at",
+    (PlanRequest(amplitude_rad_s=15.0), "speed window (upper end): an amplitude of 15 rad/s (143 rpm) at",
      "If you meant rpm, write --amplitude 15rpm. Otherwise change --amplitude, --offset, --frequency or the limits"),
     (PlanRequest(amplitude_rad_s=15.00005), "of 15 rad/s (143 rpm)", "Change --amplitude"),    # 143.24rpm
     (PlanRequest(amplitude_rad_s=400.0), "of 400 rad/s (3820 rpm)", "Change --amplitude"),
