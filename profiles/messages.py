@@ -189,6 +189,18 @@ class MessageCode(Enum):
         62, "A change of scale may not be detected",
         "With this drill string, no cross-check can be compared with J.",
         "Repeat the run, and compare the two results.")
+    CALIBRATION_UNCHECKED = (
+        63, "The torque calibration may belong to another drive",
+        "The drive or the calibration has no serial number, as on Modbus, so tdhil cannot compare the two.",
+        "Compare the nameplate of this drive with that of the calibrated one.")
+    FACTOR_UNLIKE_SCALE = (
+        64, "The calibration factor contradicts the stated torque scale",
+        "The factor differs from 1 by more than the uncertainties of the stated scale and of the calibration allow.",
+        "Check the body, the reference or the pipe, and torque_scale_rel_sd in rig.yaml.")
+    GEAR_LOSS_IN_FACTOR = (
+        65, "The calibration factor includes the loss of a gear",
+        "The torque sensor is behind the gear, and the torque that the gear loses counts as an error of the drive.",
+        "Measure at the motor shaft, or note pairs with rising and with falling torque at standstill.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -10,6 +10,9 @@ both runs cancels in J. Relative errors x₁ and x₂ of the runs give
 
     dJ/J = (1 + J/b)(x₁ − x₂),        dκ/κ = (y₁ x₁ − y₂ x₂)/(y₂ − y₁),        plus db/b of the body in either.
 
+One balance and one gauge measure all bodies. So the least of their relative uncertainties, such as the assumed 0.2 %,
+is one error δ that all bodies share, dκ/κ = dJ/J = δ for any number of bodies. The rest of a body is its own error.
+
 With more than two runs the line is fitted by generalised least squares with the weights C⁻¹; C is the covariance of the
 runs plus that of the bodies. The residuals test whether the line is straight. Uncertainties are propagated to first
 order (GUM 5.2), degrees of freedom by Welch and Satterthwaite (GUM G.4); coverage intervals are symmetric with
@@ -22,6 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from profiles.quantities import printed_bound, printed_share
 from tdhil.estimation import ResidualTest, Verdict
 from tdhil.estimation.frequency_domain import CERTAIN, student_quantile
@@ -145,6 +149,7 @@ class TorqueCalibration:
     slope: float = math.nan
     intercept_kg_m2: float = math.nan
     line_covariance: tuple[tuple[float, ...], ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
@@ -190,16 +195,30 @@ def calibrate_torque(case: CalibrationCase) -> TorqueCalibration:
             body = printed_bound(least, 3, up=True)
             advice = f"use a body of {body} kg·m² or more at the motor, or measure for longer"
         return replace(refused, reason=reason, advice=advice, least_added_kg_m2=least)
-    # the uncertainty of the factor itself is added to the allowed error
-    most = max(LARGEST_ERROR, LARGEST_IN_SD * case.scale_rel_sd) + student_quantile(case.confidence, CERTAIN) * (
-        factor.standard_uncertainty)
-    if abs(factor.value - 1.0) > most:
-        return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value),
-                       reason=f"the calibration factor would be {factor.value:.3g}: more than {100 * most:.0f} % from "
-                       "1 is no error of a torque scale")
+    impossible, warnings = compared(factor, case.scale_rel_sd, assumed, "the inertia of the body")
+    if impossible:
+        return replace(refused, verdict=Verdict.MODEL_REJECTED, advice=_shaft(case, factor.value), reason=impossible)
     reason = (f"the runs give κ to {printed_share(factor.half_width_share)} and J to "
               f"{printed_share(inertia.half_width_share)}")
-    return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia)
+    return replace(refused, verdict=Verdict.VALID, reason=reason, factor=factor, inertia_kg_m2=inertia,
+                   warnings=warnings)
+
+
+def compared(factor: MeasuredValue, scale_rel_sd: float, stated: float, reference: str) -> tuple[str, tuple[str, ...]]:
+    """Return why κ is no error of a torque scale ('' if it can be one), and a warning if the stated scale excludes it.
+
+    Warning: E_n = |κ − 1|/√(U_stated² + U_κ²) > 1 (ISO/IEC 17043). ``stated``: U_stated; ``reference``: what to check.
+    """
+    error, half = abs(factor.value - 1.0), 0.5 * (factor.high - factor.low)
+    most = max(LARGEST_ERROR, LARGEST_IN_SD * scale_rel_sd) + half
+    if error > most:
+        return (f"the calibration factor would be {factor.value:.3g}: more than {100 * most:.0f} % from 1 is no error"
+                " of a torque scale"), ()
+    if error <= math.hypot(stated, half):
+        return "", ()
+    text = (f"the factor differs from 1 by {100.0 * error:.2g} %, and the stated torque scale allows"
+            f" {printed_share(stated)}. Check {reference}, or the stated scale")
+    return "", (CodedText(text, MessageCode.FACTOR_UNLIKE_SCALE),)
 
 
 def _falls(points: Sequence[FittedPoint]) -> str:
@@ -230,23 +249,33 @@ class _FittedLine:
     by_reported: FloatArray            # ∂beta/∂y, (2, n); the derivative by the bodies is −slope times that
     covariance: FloatArray
     linearity: ResidualTest | None
+    body_errors: dict[str, FloatArray]
+    of_bodies: FloatArray              # their covariance, (n, n), (kg·m²)²
 
 
-_ROUNDS = 10
+_ROUNDS, _ROUNDING = 10, 1e-6
 
 
-def _of_bodies(case: CalibrationCase) -> FloatArray:
-    """Return the covariance of the bodies' inertias, (n, n), (kg·m²)².
+def _body_errors(case: CalibrationCase) -> dict[str, FloatArray]:
+    """Return the independent errors of the bodies by source: the standard uncertainty of each run's body, (n,), kg·m².
 
-    The error of a body does not average out over its runs.
+    The error of a body does not average out over its runs, nor the error that all bodies share over the bodies.
     """
     bodies = [run.body for run in case.runs]
-    return np.array([[one[1] * other[1] if one == other else 0.0 for other in bodies] for one in bodies])
+    added, sd = (np.array(one) for one in zip(*bodies, strict=True))
+    shared = float(np.min(sd[added > 0.0] / added[added > 0.0])) * added
+    own = np.sqrt(np.maximum(sd**2 - shared**2, 0.0)) * (sd > shared * (1.0 + _ROUNDING))
+    errors = [("bodies of " if len({body for body in bodies if body[0] > 0.0}) > 1 else "body of ", "", shared)]
+    errors += [("body of ", ", own error", np.where([one == body for one in bodies], own, 0.0))
+               for body in dict.fromkeys(bodies)]
+    return {what + ", ".join(run.name for run, one in zip(case.runs, sds, strict=True) if one > 0.0) + which: sds
+            for what, which, sds in errors if sds.any()}
 
 
 def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
     design = np.column_stack([np.ones_like(added), added])
-    bodies = _of_bodies(case)
+    errors = _body_errors(case)
+    bodies = sum((np.outer(sd, sd) for sd in errors.values()), np.zeros_like(case.covariance))
     slope = 1.0
     for _ in range(_ROUNDS):
         whole = case.covariance + slope**2 * bodies
@@ -264,7 +293,7 @@ def _line(case: CalibrationCase, added: FloatArray) -> _FittedLine:
 
         statistic, more = float(left @ np.linalg.solve(whole, left)), float(len(added) - 2)
         linearity = ResidualTest(statistic, more, float(chdtrc(more, statistic)))
-    return _FittedLine(beta, by, covariance, linearity)
+    return _FittedLine(beta, by, covariance, linearity, errors, bodies)
 
 
 def _propagated(
@@ -286,17 +315,14 @@ def _propagated(
     shared = [math.sqrt(max(float(one @ rest @ one), 0.0)) for one in both]
     scale = math.sqrt(max(float(np.trace(rest)) / len(case.runs), 0.0))
     lines.append(CalibrationLine("filters of the reports", scale, "Student", case.degrees_of_freedom, *shared))
-    for body in dict.fromkeys(run.body for run in case.runs):
-        if (sd := body[1]) > 0.0:
-            has = [run.body == body for run in case.runs]
-            names = ", ".join(run.name for run, one in zip(case.runs, has, strict=True) if one)
-            shares = (abs(float(np.sum(one[has]))) * slope * sd for one in both)
-            lines.append(CalibrationLine(f"body of {names}", sd, "normal", CERTAIN, *shares))
+    for source, sds in line.body_errors.items():
+        lines.append(CalibrationLine(source, float(sds.max()), "normal", CERTAIN,
+                                     *(abs(float(one @ sds)) * slope for one in both)))
     reading = case.reading_rel_sd
     if reading > 0.0:
         lines.append(CalibrationLine(
             "moment of reading", reading * float(intercept), "rectangular", CERTAIN, reading, 0.0))
-    found, of_bodies = [], slope**2 * _of_bodies(case)
+    found, of_bodies = [], slope**2 * line.of_bodies
     for value, row, shared_sd in ((factor, both[0], reading), (inertia, both[1], 0.0)):
         runs, bodies = float(row @ case.covariance @ row), float(row @ of_bodies @ row) + shared_sd**2
         variance = runs + bodies

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 from profiles.quantities import printed_share
 from tdhil.calibration.added_body import (
-    LARGEST_ERROR,
     FactorLine,
     MeasuredValue,
+    compared,
     effective_degrees_of_freedom,
     measured_value,
 )
@@ -90,6 +90,7 @@ class KnownPipeFit:
     typed_half_width: float
     refusal: str = ""
     advice: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 def calibrate_known_pipe(
@@ -109,7 +110,6 @@ def calibrate_known_pipe(
     dof = effective_degrees_of_freedom([(line.of_factor, line.degrees_of_freedom) for line in budget])
     factor = measured_value(value, sd, dof, confidence)
     typed = quantile * scale_rel_sd
-    fit = KnownPipeFit(factor, budget, typed)
     if factor.half_width_share >= typed:
         worst = max(budget, key=lambda line: line.of_factor)
         return KnownPipeFit(
@@ -117,9 +117,6 @@ def calibrate_known_pipe(
             f"which is wider than the torque scale as stated so far (±{100 * typed:.1f} %); "
             f"most comes from: {worst.source}",
             "state the measured sizes of the pipe with their tolerances in string.yaml, or use a body of known inertia")
-    if abs(value - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:
-        return KnownPipeFit(
-            factor, budget, typed, f"the calibration factor would be {value:.3g}: more than {100 * LARGEST_ERROR:.0f} "
-            "% from 1 is no error of a torque scale",
-            "compare the diameters in string.yaml with the pipe, and the gear ratio with the drive")
-    return fit
+    reason, warnings = compared(factor, scale_rel_sd, typed, "the sizes of the pipe")
+    advice = "compare the diameters in string.yaml with the pipe, and the gear ratio with the drive" if reason else ""
+    return KnownPipeFit(factor, budget, typed, reason, advice, warnings)

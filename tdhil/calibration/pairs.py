@@ -25,9 +25,9 @@ import numpy as np
 from profiles.quantities import printed_share
 from tdhil.calibration.added_body import (
     CONTRADICTED_P,
-    LARGEST_ERROR,
     FactorLine,
     MeasuredValue,
+    compared,
     effective_degrees_of_freedom,
     measured_value,
 )
@@ -136,18 +136,17 @@ def calibrate_pairs(
     effective = effective_degrees_of_freedom([(line.of_factor, line.degrees_of_freedom) for line in budget])
     factor = measured_value(slope, factor_sd, effective, confidence)
     refusal, assumed = "", normal_quantile(confidence) * scale_rel_sd
-    plausible = abs(slope - 1.0) <= LARGEST_ERROR + 2.0 * factor_sd
-    too_wide = plausible and not factor.half_width_share <= assumed
+    impossible, warnings = compared(factor, scale_rel_sd, assumed, "the reference")
+    too_wide = not impossible and not factor.half_width_share <= assumed
     if too_wide:
         refusal = (f"the pairs leave κ at {printed_share(factor.half_width_share)}, and the stated torque scale leaves"
                    f" ±{100 * assumed:.1f} %: measure larger torques, or more pairs")
-    elif not plausible:
-        refusal = (f"the calibration factor would be {slope:.3g}: more than {100 * LARGEST_ERROR:.0f} % from 1 is no "
-                   "error of a torque scale; check units, signs, and the shaft that the reference stands at")
+    elif impossible:
+        refusal = f"{impossible}; check units, signs, and the shaft that the reference stands at"
     elif statistic.p_value < CONTRADICTED_P and abs(hysteresis or 0.0) < float(np.std(left)) and _bent(pairs, left):
         refusal = "the reference torque is no straight line over the reported one: its residuals are curved"
     return PairsFit(factor, measured_value(intercept, math.sqrt(covariance[1, 1]), dof, confidence), covariance, left,
-                    statistic, spread, hysteresis, refusal, tuple(budget), too_wide)
+                    statistic, spread, hysteresis, refusal, tuple(budget), too_wide, () if refusal else warnings)
 
 
 def _bent(pairs: TorquePairs, left: FloatArray) -> bool:

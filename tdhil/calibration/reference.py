@@ -30,9 +30,9 @@ import numpy as np
 
 from profiles.quantities import printed_share
 from tdhil.calibration.added_body import (
-    LARGEST_ERROR,
     FactorLine,
     MeasuredValue,
+    compared,
     effective_degrees_of_freedom,
     measured_value,
 )
@@ -110,6 +110,7 @@ class ReferenceFit:
     effective_samples: float = math.nan
     budget: tuple[FactorLine, ...] = ()
     series: ReferenceSeries | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def scale_of_reference(stated_rel_sd: float | None) -> tuple[float, tuple[str, ...]]:
@@ -451,9 +452,6 @@ def _judged(
             found, refusal=f"the torque varies too little: {found.swing_nm:.3g} N·m leave κ at"
             f" {printed_share(factor.half_width_share)}, and the stated torque scale leaves ±{100 * assumed:.1f} %",
             advice="change the torque by more, in steps and slowly, or record for longer")
-    if abs(k - 1.0) > LARGEST_ERROR + 2.0 * factor.standard_uncertainty:
-        return replace(
-            found, refusal=f"the calibration factor would be {k:.3g}: more than {100 * LARGEST_ERROR:.0f} % from 1 is "
-            "no error of a torque scale",
-            advice="check the unit of the reference, and the shaft that it stands at (--at)")
-    return found
+    reason, warnings = compared(factor, scale_rel_sd, assumed, "the reference")
+    advice = "check the unit of the reference, and the shaft that it stands at (--at)" if reason else ""
+    return replace(found, refusal=reason, advice=advice, warnings=warnings)

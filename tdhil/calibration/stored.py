@@ -16,6 +16,7 @@ _NUMBERS: Final = ("value", "low", "high", "confidence")
 _LEAST, _MOST = 0.1, 10.0
 """Range of a plausible factor. Beyond it, a document is not a calibration of a drive."""
 _ALIKE = 1e-6
+_NUMBERS_OF_DRIVE: Final = ("vendor", "product", "serial")
 
 
 class CalibrationUnusable(ValueError):
@@ -84,13 +85,27 @@ class StoredCalibration:
         """
         return max(self.own_rel_sd, 0.5 * (self.high - self.low) / self.factor / normal_quantile(self.confidence))
 
-    def another_drive(self, drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-        """Return the difference to this drive or its settings, in words; '' if there is none."""
-        for ours, theirs in ((self.drive, drive), (self.settings, settings)):
-            for name in ours.keys() & theirs.keys():
-                if name not in ("name", "profile") and _differ(ours[name], theirs[name]):
-                    return f"its {name} is {ours[name]}, and {theirs[name]} here"
+    def another_drive(self, drive: Mapping[str, Any], settings: Mapping[str, Any], simulated: bool | None) -> str:
+        """Return the difference to this drive or its settings, in words; '' if there is none.
+
+        ``simulated``: whether this drive is simulated; None: not compared.
+        """
+        if simulated is not None and simulated != self.simulated:
+            return "it was measured on a simulated drive" if self.simulated else "this drive is simulated"
+        for name in _NUMBERS_OF_DRIVE:
+            if self.knows(name, drive) and self.drive[name] != drive[name]:
+                return f"its {name} is {self.drive[name]}, and {drive[name]} here"
+        # Vendor and product number state the type of a drive, so its profile may have another name. Where they are not
+        # known, as on Modbus, only the profile states the type and the unit of torque.
+        typed = self.knows("vendor", drive) and self.knows("product", drive)
+        for name, ours in self.settings.items():
+            if _differ(ours, settings.get(name)) and not (typed and name == "profile"):
+                return f"its {name} is {ours}, and {settings[name]} here"
         return ""
+
+    def knows(self, name: str, drive: Mapping[str, Any]) -> bool:
+        """Return whether this number of the drive is known on both sides. 0 is not known: Modbus has no such number."""
+        return bool(self.drive.get(name) and drive.get(name))
 
     def too_old(self, started: str | None, valid_days: float) -> str:
         """Return the age of the calibration at the start of a run, in words, if it exceeds ``valid_days``; else ''."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.cli.arguments import require_new
@@ -81,33 +80,36 @@ def _one_log(namespace: argparse.Namespace, kind: str) -> RunRecord:
 def _pairs(namespace: argparse.Namespace, confidence: float) -> _Found:
     from tdhil.calibration import calibrate_pairs, scale_of_reference
     from tdhil.report import pairs_document
-    from tdhil.session import drive_identity, drive_settings, log_of_calibration, read_pairs
+    from tdhil.session import date_of_log, drive_identity, drive_settings, gear_before, log_of_calibration, read_pairs
 
     if len(namespace.logs) > 1 or (namespace.save is not None and not namespace.logs):
         raise UsageError("takes one log, which names the drive", where="--save" if namespace.save else "--pairs",
                          next_step=f"Such as: {_EXAMPLES['pairs']}")
     pairs = read_pairs(namespace.pairs)
     record = _one_log(namespace, "pairs") if namespace.logs else None
+    rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     if namespace.at == "main":
         if record is None:
             raise UsageError("needs a log, which has the gear ratio", where="--at main",
                              next_step="Such as: tdhil calibrate torque run.mcap --pairs pairs.csv --at main")
-        ratio = record.recording.gear_ratio
+        ratio, loss = gear_before(record.recording, "main")
+        if len(set(pairs.direction)) < 2:       # with both directions, friction of the gear is in the hysteresis
+            warnings = (*loss, *warnings)
         pairs = replace(pairs, reference_nm=pairs.reference_nm / ratio, reference_sd_nm=pairs.reference_sd_nm / ratio)
-    rel_sd, warnings = scale_of_reference(_reference_sd(namespace))
     scale = {} if record is None else {"scale_rel_sd": record.recording.torque_scale_rel_sd}
     try:
-        found = replace(calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale), warnings=warnings)
+        found = calibrate_pairs(pairs, confidence, reference_rel_sd=rel_sd, **scale)
     except ValueError as error:
         raise UsageError(str(error), where=str(namespace.pairs)) from None
-    drive = {} if record is None else drive_identity(record.configuration)
-    settings = {} if record is None else drive_settings(record.configuration, record.recording)
-    document = pairs_document(
-        found, pairs, str(namespace.pairs), drive, settings, confidence=confidence,
-        date=datetime.now().astimezone().isoformat(timespec="seconds"),
-        simulated=record is not None and record.recording.simulated,
-        runs=() if record is None else (log_of_calibration(record),))
-    return document, record
+    found = replace(found, warnings=(*found.warnings, *warnings))
+    if record is None:      # no day of the measurement is known: the document is no calibration for rig.yaml
+        return pairs_document(found, pairs, str(namespace.pairs), {}, {}, confidence=confidence, date=None,
+                              simulated=False), None
+    run = log_of_calibration(record)
+    return pairs_document(
+        found, pairs, str(namespace.pairs), drive_identity(record.configuration),
+        drive_settings(record.configuration, record.recording), confidence=confidence, date=date_of_log(run),
+        simulated=record.recording.simulated, runs=(run,)), record
 
 
 def _reference_sd(namespace: argparse.Namespace) -> float | None:

@@ -193,6 +193,9 @@ def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, c
     console.print(table)
     for text in _conclusions(planned):
         console.print(Text(text))
+    if figures[0].source == "assumed":
+        console.print(Text(f"J of {figures[0].text} is assumed from the limits. For a forecast of your machine, state "
+                           "expected.inertia_kg_m2 in rig.yaml."))
 
 
 def _conclusions(planned: Planned) -> list[str]:

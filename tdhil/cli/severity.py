@@ -117,9 +117,14 @@ def _inertia(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[
 def _surface(
     recording: Recording, result: Mapping[str, Any], namespace: argparse.Namespace
 ) -> tuple[SurfaceRecord, list[str]]:
-    """Return the record at the main shaft, with the lags of its reports, and warnings."""
+    """Return the record at the main shaft, with the lags of its reports, and warnings.
+
+    Its torque is read in the drive's own N·m. J of a calibrated result is not, so the result's calibration is applied.
+    """
     import numpy as np
 
+    from tdhil.cli.tune_inputs import COVERAGE, calibration_factor
+    from tdhil.estimation import normal_quantile
     from tdhil.soft_torque import SurfaceRecord
 
     good = recording.fresh & np.isfinite(recording.speed_rad_s) & np.isfinite(recording.torque_nm)
@@ -138,8 +143,11 @@ def _surface(
             remarks.append(f"The lag of the reported {name.split('_')[0]} is not known and counts as 0: state it with "
                         f"--{name.removesuffix('_s').replace('_', '-')}.")
         lags.append(max(0.0, float(value or 0.0)))
-    return SurfaceRecord(time_s[kept], recording.speed_rad_s[good][kept] / ratio,
-                         recording.torque_nm[good][kept] * ratio, *lags), remarks
+    stated = result.get("torque_scale_rel_sd")
+    wide = normal_quantile(COVERAGE) * (
+        float(stated) if isinstance(stated, int | float) else recording.torque_scale_rel_sd)
+    return SurfaceRecord(time_s[kept], recording.speed_rad_s[good][kept] / ratio, calibration_factor(result)
+                         * recording.torque_nm[good][kept] * ratio, lags[0], lags[1], (1.0 - wide, 1.0 + wide)), remarks
 
 
 def _expected(namespace: argparse.Namespace) -> tuple[TopDrive, SpeedController]:

@@ -46,9 +46,11 @@ def run(namespace: argparse.Namespace) -> int:
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
     if not connection.configured:
         raise UsageError(
-            connection.bus.nothing_there,
+            f"{connection.bus.nothing_there}, so nothing was sent, and the shaft may still turn. In danger, use the"
+            " hard-wired emergency stop",
             where="stop",
-            next_step=f"Give the drive's address, such as {examples()}",
+            next_step=f"Type tdhil stop --rig rig.yaml. Without that file, name the profile and the address: --profile"
+            f" NAME with {examples()}",
             entry=MessageCode.BUS_NOT_CONFIGURED,
         )
     print(NO_EMERGENCY_STOP, file=sys.stderr)  # noqa: T201

@@ -401,7 +401,7 @@ def require_limits(rig: Rig | None) -> Limits:
     if rig is not None and rig.limits is not None:
         return rig.limits
     where = rig._file if rig is not None and rig._file else "rig.yaml"
-    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where,
+    raise PreflightRefused("no machine limits, and no real shaft moves without them", where=where,
                            next_step=limits_step(rig), entry=MessageCode.NO_LIMITS)
 
 

@@ -16,7 +16,7 @@ from tdhil.report.acceptance import SIGNATURE_LINE
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Report, ReportSection, Table, shown_date
 from tdhil.report.card import sentence
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.document import NO_REAL_SHAFT, SIMULATED
+from tdhil.report.document import NO_REAL_SHAFT, SIMULATED, coded_warnings
 from tdhil.report.intervals import interval_and_share, percent, rounded
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def print_calibration_card(
         body.append(Words(sentence(document["advice"]), style="italic"))
     if remark:
         body.append(Words(sentence(remark), style="dim"))
-    body += [Words(f"! {warning}", style="yellow") for warning in document["warnings"]]
+    body += [Words(f"! {warning}", style="yellow") for warning in coded_warnings(document)]
     title += f" · {SIMULATED}" if document["simulated"] else ""
     console.print(Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue"))
 
@@ -156,7 +156,7 @@ def laboratory_page(
             VERDICT_COLOUR.get(document["verdict"], "yellow"),
             "No number" if factor is None else f"κ = {with_share(factor, '')}", tuple(lines), document["verdict"],
             sentence(document["reason"]), sentence(document["advice"])),
-        warnings=tuple(document["warnings"]),
+        warnings=coded_warnings(document),
         sections=tuple(one for one in sections if one.blocks),
         footer=f"tdhil {document['tdhil']}",
     )

@@ -127,7 +127,7 @@ def run_facts(
                               MessageCode.RUN_ENDED_EARLY), *warnings)
     return {
         "warnings": list(warnings),
-        "warning_codes": _codes(warnings),
+        "warning_codes": codes_of(warnings),
         "gear_ratio": recording.gear_ratio,
         "simulated": recording.simulated,
         "rehearsed_faults": rehearsed_faults(run),
@@ -203,7 +203,7 @@ def result_document(
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,
         "warnings": list(found.warnings),
-        "warning_codes": _codes(found.warnings),
+        "warning_codes": codes_of(found.warnings),
         "simulated": recording.simulated,
         "rehearsed_faults": rehearsed_faults(run),
         "rehearsal": rehearsal_of(run),
@@ -258,7 +258,8 @@ def coded_reason(reason: str, document: Mapping[str, Any]) -> str:
     return with_code(reason, "" if code == MessageCode.VALID.code else code)
 
 
-def _codes(warnings: Sequence[str]) -> list[str]:
+def codes_of(warnings: Sequence[str]) -> list[str]:
+    """Return the code of each warning; that of `RESULT_WARNING` for a plain text."""
     return [entry_of(one, MessageCode.RESULT_WARNING).code for one in warnings]
 
 

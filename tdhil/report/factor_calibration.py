@@ -28,6 +28,7 @@ from tdhil.report.calibration_page import (
     shown_degrees,
 )
 from tdhil.report.console import PlainConsole
+from tdhil.report.document import codes_of
 from tdhil.report.intervals import part_with_interval
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
@@ -45,10 +46,13 @@ PAIRS, REFERENCE, KNOWN_PIPE = "pairs", "reference", "known_pipe"
 
 
 def pairs_document(
-    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str, confidence: float,
-    simulated: bool, runs: Sequence[Part] = (),
+    found: PairsFit, pairs: TorquePairs, source: str, drive: Part, settings: Part, *, date: str | None,
+    confidence: float, simulated: bool, runs: Sequence[Part] = (),
 ) -> dict[str, Any]:
-    """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log."""
+    """Return plain data for `json.dumps`; ``source``: file of the pairs; ``drive``: as in a log.
+
+    ``date``: of the measurement; None if it is not known.
+    """
     return {
         **_begun(PAIRS, "valid" if not found.refusal else "not_identifiable" if found.too_wide else "model_rejected",
                  found.refusal or (f"{len(pairs.direction)} pairs give κ to "
@@ -126,7 +130,8 @@ def known_pipe_document(
             "residual": None if measured is None or measured.residual is None else asdict(measured.residual),
             "inputs": [asdict(one) for one in known.inputs],
         },
-        **_ended(str(source["file"]), runs, drive, settings, date, simulated, ()),
+        **_ended(str(source["file"]), runs, drive, settings, date, simulated,
+                 () if found is None else found.warnings),
         "string": dict(source),
     }
 
@@ -136,11 +141,12 @@ def _begun(method: str, verdict: str, reason: str, advice: str) -> dict[str, Any
 
 
 def _ended(
-    source: str, runs: Sequence[Part], drive: Part, settings: Part, date: str, simulated: bool, warnings: Sequence[str]
+    source: str, runs: Sequence[Part], drive: Part, settings: Part, date: str | None, simulated: bool,
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
     return {"source": source, "runs": [dict(run) for run in runs], "drive": dict(drive) or None,
             "settings": dict(settings), "date": date, "simulated": simulated, "warnings": list(warnings),
-            "tdhil": __version__}
+            "warning_codes": codes_of(warnings), "tdhil": __version__}
 
 
 def _budget_lines(budget: Sequence[FactorLine]) -> list[dict[str, Any]]:

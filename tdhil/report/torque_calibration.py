@@ -27,6 +27,7 @@ from tdhil.report.calibration_page import (
     with_share,
 )
 from tdhil.report.console import PlainConsole
+from tdhil.report.document import codes_of
 from tdhil.report.intervals import plus_minus
 from tdhil.report.plots import DARK, OURS, QUIET
 from tdhil.version import __version__
@@ -73,6 +74,7 @@ def calibration_document(
         "date": date,
         "simulated": simulated,
         "warnings": list(warnings),
+        "warning_codes": codes_of(warnings),
         "tdhil": __version__,
     }
 

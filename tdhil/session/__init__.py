@@ -39,8 +39,9 @@ if TYPE_CHECKING:
         is_accepted as is_accepted,
     )
     from tdhil.session.reference_calibration import (
-        find_by_known_pipe as find_by_known_pipe, find_by_reference as find_by_reference,
-        known_pipe_of as known_pipe_of, log_of_calibration as log_of_calibration,
+        date_of_log as date_of_log, find_by_known_pipe as find_by_known_pipe,
+        find_by_reference as find_by_reference, gear_before as gear_before, known_pipe_of as known_pipe_of,
+        log_of_calibration as log_of_calibration,
     )
     from tdhil.session.pace import PaceMeasured as PaceMeasured, measure_pace as measure_pace
     from tdhil.session.rehearsal import (
@@ -109,5 +110,6 @@ else:
         "task": "bench_of excitation_request facts machine_limits stated_lags suited",
         "torque_calibration": "ASSUMED_BODY_REL_SD CalibrationFound CalibrationRun document_of_calibration "
                               "find_calibration find_plan read_pairs",
-        "reference_calibration": "find_by_known_pipe find_by_reference known_pipe_of log_of_calibration",
+        "reference_calibration": "date_of_log find_by_known_pipe find_by_reference gear_before known_pipe_of "
+                                 "log_of_calibration",
     })

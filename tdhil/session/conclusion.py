@@ -120,7 +120,7 @@ def conclude(
     identification = _dated(identification, applied.day)
     said = (
         *(CodedText(one, MessageCode.TRACE_ASSUMPTION) for one in warnings or ()),
-        *(CodedText(one, MessageCode.CALIBRATION_WARNING) for one in applied.warnings),
+        *applied.warnings,
         *(one for one in run_warnings(run) if not _repeated(one, identification.warnings)),
     )
     if said:

@@ -38,7 +38,7 @@ class Figure:
 
     @property
     def text(self) -> str:
-        return f"{self.value:.4g} {self.unit}"
+        return f"{float(f'{self.value:.4g}'):g} {self.unit}"
 
 
 def plan_dry(
@@ -110,6 +110,7 @@ def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: Machine
             "speed_min_rad_s": limits.speed_min_rad_s,
             "speed_max_rad_s": limits.speed_max_rad_s,
             "torque_nm": limits.torque_nm,
+            "time_s": limits.time_s,
         },
         "rests_on": [asdict(figure) for figure in figures],
         "expected_half_width": planned.half_width if math.isfinite(planned.half_width) else None,
@@ -136,7 +137,9 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, profile: Profile) -> N
     room = _room(options, limits)
     _refuse_undersampled(options, profile)
     try:
-        refuse_hopeless_plan(excitation_request(options), modes, room, guess, known)
+        wish = excitation_request(options)
+        wish = replace(wish, max_time_s=min(wish.max_time_s or math.inf, limits.time_s))
+        refuse_hopeless_plan(wish, modes, room, guess, known)
     except PlanRefused as error:
         raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step,
                                entry=MessageCode.PLAN_NOT_POSSIBLE) from error

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.errors import UsageError
+from profiles import CodedText
+from tdhil.errors import MessageCode, UsageError
 from tdhil.file_hash import sha256_of
 from tdhil.session.run_record import RunRecord
 from tdhil.session.stored_calibration import drive_identity, drive_settings, refuse_rehearsal
 
 if TYPE_CHECKING:
     from tdhil.calibration import KnownPipe
+    from tdhil.recording import Recording
     from tdhil.soft_torque import StringFile, WaveLine
 
 
@@ -23,6 +25,23 @@ def log_of_calibration(record: RunRecord) -> dict[str, Any]:
     """Return log, name, hash and date of a recording, for the document of a calibration."""
     return {"log": record.log, "name": Path(record.log).name, "sha256": sha256_of(Path(record.log)),
             "date": record.configuration.get("started")}
+
+
+def date_of_log(run: Mapping[str, Any]) -> str:
+    """Return the date of a log, from `log_of_calibration`; the present time for a trace, which has no date."""
+    return str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds"))
+
+
+def gear_before(recording: Recording, at: str) -> tuple[float, tuple[str, ...]]:
+    """Return the ratio of the gear between drive and sensor at the shaft ``at``, and a warning about its loss.
+
+    While the drive turns the load, the sensor shows the torque less this loss. No key of rig.yaml states an efficiency.
+    """
+    ratio = recording.gear_ratio if at == "main" else 1.0
+    return ratio, () if ratio == 1.0 else (CodedText(
+        f"the sensor is behind a gear of {ratio:g}: the loss of the gear is in the factor, and not in its interval."
+        " Measure at the motor shaft, or note pairs with rising and with falling torque at standstill",
+        MessageCode.GEAR_LOSS_IN_FACTOR),)
 
 
 def find_by_reference(
@@ -42,7 +61,7 @@ def find_by_reference(
     refuse_rehearsal(record)
     recording = record.recording
     sensor = read_reference(trace, parse_columns(columns or (), TIME_AND_TORQUE, REFERENCE_FLAG))
-    ratio = recording.gear_ratio if at == "main" else 1.0
+    ratio, loss = gear_before(recording, at)
     rel_sd, assumed = scale_of_reference(reference_rel_sd)
     good = recording.fresh
     drive = TorqueRecord(recording.time_s[good], recording.torque_nm[good] - recording.torque_offset_nm,
@@ -60,8 +79,8 @@ def find_by_reference(
     return reference_document(
         found, {"file": str(trace), "sha256": digest, "at": at, "rel_sd": rel_sd}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
-        date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
-        simulated=recording.simulated, warnings=[*sensor.warnings, *assumed])
+        date=date_of_log(run), confidence=confidence,
+        simulated=recording.simulated, warnings=[*found.warnings, *loss, *sensor.warnings, *assumed])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -150,7 +169,7 @@ def find_by_known_pipe(record: RunRecord, path: Path, confidence: float) -> dict
     return known_pipe_document(
         found, measured, known, refusal, {"file": str(path), "sha256": sha256_of(path)}, (run,),
         drive_identity(record.configuration), drive_settings(record.configuration, recording),
-        date=str(run["date"] or datetime.now().astimezone().isoformat(timespec="seconds")), confidence=confidence,
+        date=date_of_log(run), confidence=confidence,
         simulated=recording.simulated)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers import PreflightRefused
+from profiles import CodedText, message_of
 from tdhil.errors import MessageCode, UsageError, existing_file
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ KEPT: Final = "torque_calibration"
 """Key of the calibration in the log's configuration."""
 VALID_DAYS: Final = 365.0
 """Validity of a calibration in days, unless rig.yaml states another."""
+_CARRIED = (MessageCode.FACTOR_UNLIKE_SCALE, MessageCode.GEAR_LOSS_IN_FACTOR)
+"""Warnings of a calibration that each result with it repeats."""
 _LARGEST_FILE = 1 << 20
 _AGAIN = "Make one with: tdhil calibrate torque without.mcap with.mcap --added J --save calibration.json"
 
@@ -81,7 +84,7 @@ def refuse_another_drive(run: Mapping[str, Any], identity: Mapping[str, Any]) ->
     if found is None:
         return
     settings = drive_settings({**run, "identity": identity})
-    if other := _other(found, identity, settings):
+    if other := found.another_drive(identity, settings, bool(identity.get("simulated"))):
         raise PreflightRefused(f"the torque calibration is of another drive: {other}", where=KEPT,
                                next_step="Calibrate this drive, or take torque_calibration out of rig.yaml")
 
@@ -102,7 +105,7 @@ def stored_of(run: Mapping[str, Any]) -> StoredCalibration | None:
 def other_drive(document: Mapping[str, Any], drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """Return how the drive of a calibration differs from this one, in words; '' if it does not, or is not known."""
     found = stored_of({KEPT: document})
-    return "" if found is None else _other(found, drive, settings)
+    return "" if found is None else found.another_drive(drive, settings, None)
 
 
 def with_calibration(run: Mapping[str, Any], recording: Recording, document: Mapping[str, Any], where: str,
@@ -122,12 +125,8 @@ def with_calibration(run: Mapping[str, Any], recording: Recording, document: Map
     found = stored_of(changed)
     if found is None:
         raise UsageError("is no calibration", where=where, next_step=_AGAIN)
-    if other := _other(found, drive_identity(run), drive_settings(run, recording)):
+    if other := found.another_drive(drive_identity(run), drive_settings(run, recording), recording.simulated):
         raise UsageError(f"is of another drive: {other}", where=where, next_step="Name the calibration of this drive")
-    if found.simulated != recording.simulated:
-        raise UsageError("is of a simulated drive, and this recording is not" if found.simulated else
-                         "is of a real drive, and this recording is simulated", where=where,
-                         next_step="Name the calibration of this drive")
     return changed
 
 
@@ -144,29 +143,55 @@ class AppliedCalibration:
 
     recording: Recording
     day: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[CodedText, ...] = ()
 
 
 def apply_calibration(recording: Recording, run: Mapping[str, Any]) -> AppliedCalibration:
     """Apply the log's calibration to a recording: the same for a live run and for its replay."""
-    if run.get(KEPT) is None:
+    document = run.get(KEPT)
+    if document is None:
         return AppliedCalibration(recording)
     found = stored_of(run)
     if found is None:
-        unread = "the torque calibration in the log can't be read; it was not applied"
-        return AppliedCalibration(recording, "", (unread,))
+        return _not_applied(recording, "the torque calibration in the log can't be read; it was not applied")
     if recording.impedance is not None:
-        own = ("the torque calibration was not applied: a measured impedance, and the gains from it, are in the drive's"
-               " own unit of torque")
-        return AppliedCalibration(recording, "", (own,))
-    if other := _other(found, drive_identity(run), drive_settings(run, recording)):
-        return AppliedCalibration(recording, "", (
-            f"the torque calibration of {found.day} was not applied, since it is of another drive: {other}",))
-    document = run[KEPT]
-    days = document.get("valid_days") if isinstance(document, Mapping) else None
-    old = found.too_old(run.get("started"), float(days) if isinstance(days, int | float) else VALID_DAYS)
-    said = f"the torque calibration of {found.day} is {old} (calibration_valid_days); calibrate again"
-    return AppliedCalibration(found.applied(recording), found.day, (said,) if old else ())
+        return _not_applied(recording, "the torque calibration was not applied: a measured impedance, and the gains"
+                            " from it, are in the drive's own unit of torque")
+    drive, settings = drive_identity(run), drive_settings(run, recording)
+    if other := found.another_drive(drive, settings, recording.simulated):
+        return _not_applied(recording, f"the torque calibration of {found.day} was not applied, since it is of another"
+                            f" drive: {other}")
+    return AppliedCalibration(found.applied(recording), found.day, tuple(
+        _doubts(found, drive, settings, run.get("started"), document)))
+
+
+def _not_applied(recording: Recording, text: str) -> AppliedCalibration:
+    return AppliedCalibration(recording, "", (CodedText(text, MessageCode.CALIBRATION_WARNING),))
+
+
+def _doubts(found: StoredCalibration, drive: Mapping[str, Any], settings: Mapping[str, Any], started: Any,
+            document: Mapping[str, Any]) -> Iterator[CodedText]:
+    """Yield the warnings about a calibration that was applied."""
+    from tdhil.calibration import OWN_LOG
+    from tdhil.report import text_of
+
+    days = document.get("valid_days")
+    if old := found.too_old(started, float(days) if isinstance(days, int | float) else VALID_DAYS):
+        yield CodedText(f"the torque calibration of {found.day} is {old} (calibration_valid_days); calibrate again",
+                        MessageCode.CALIBRATION_WARNING)
+    texts, codes = (part if isinstance(part, list) else [] for part in (
+        document.get("warnings"), document.get("warning_codes")))
+    for text, code in zip(texts, codes, strict=False):
+        if (entry := message_of(str(code))) is not None and entry in _CARRIED:
+            yield CodedText(f"the torque calibration of {found.day} has a warning: {text_of(text)}", entry)
+    names = found.settings.get("profile"), settings.get("profile")
+    if all(names) and names[0] != names[1]:
+        yield CodedText(f"the torque calibration of {found.day} was made with the profile {names[0]}, and this run with"
+                        f" {names[1]}. Check that both have the same unit of torque", MessageCode.CALIBRATION_WARNING)
+    if not document.get(OWN_LOG) and not found.knows("serial", drive):
+        yield CodedText(f"it was not checked whether the torque calibration of {found.day} belongs to this drive: its"
+                        " serial number is not known on both sides. Compare the nameplates",
+                        MessageCode.CALIBRATION_UNCHECKED)
 
 
 def drive_settings(run: Mapping[str, Any], recording: Recording | None = None) -> dict[str, Any]:
@@ -183,10 +208,6 @@ def drive_identity(run: Mapping[str, Any], _recording: Recording | None = None) 
     """Return name and numbers of the drive; empty for a trace."""
     identity = _part(run.get("identity"))
     return {name: identity[name] for name in ("name", "vendor", "product", "serial") if name in identity}
-
-
-def _other(found: StoredCalibration, drive: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    return found.another_drive(drive, settings)
 
 
 def _part(value: Any) -> Mapping[str, Any]:

@@ -99,8 +99,9 @@ def find_calibration(runs: Sequence[CalibrationRun], at: str, confidence: float 
         bodies, values, covariance, known, dof, sharing, _unlike(runs, identified),
         max(run.record.recording.torque_scale_rel_sd for run in runs), ratio, confidence,
         _reading_rel_sd(runs, identified) if together else 0.0)
-    return CalibrationFound(
-        calibrate_torque(case), tuple(runs), tuple(identified), at, confidence, together, tuple(warnings))
+    found = calibrate_torque(case)
+    return CalibrationFound(found, tuple(runs), tuple(identified), at, confidence, together,
+                            (*found.warnings, *warnings))
 
 
 def document_of_calibration(found: CalibrationFound) -> dict[str, Any]:

@@ -15,7 +15,8 @@ a known part of the spectrum of n.
 
 **Fit.** n is a first-order Gauss–Markov process: its density is 4σ²θ/(1 + (Ωθ)²). σ, and θ where the record shows it,
 maximise Whittle's likelihood of the averaged spectrum (Hann windows with half overlap) in the band of the string's
-lowest modes. The interval is the root of the sum of squares of the scatter, J, and the string's tolerances.
+lowest modes. The interval is the root of the sum of squares of the scatter, J, the torque scale, and the string's
+tolerances.
 
 **Held correlation time.** If the record does not show θ, it is held at the stated value. The record then determines the
 density at the string's lowest mode, which excites stick-slip. σ is that of a noise with the held θ and this density.
@@ -129,6 +130,8 @@ def bit_noise_in(record: SurfaceRecord, string: DrillString, inertia: Interval) 
             f"{value.misfit:.1f} times its scatter",
             next_step="Check length and sizes in string.yaml, J and the lags of the reports")
     moved = [[_fitted(spectra, string, end, record, held_s).rms for end in (inertia.low, inertia.high)]]
+    moved.append([_fitted(replace(spectra, torque=end * spectra.torque, torque_noise=end**2 * spectra.torque_noise),
+                          string, end * inertia.value, record, held_s).rms for end in record.scale_ends])
     moved += [[_fitted(spectra, end, inertia.value, record, held_s).rms for end in pair]
               for pair in (*string_ends(string), *_bit_ends(string))]
     if value.correlation_log_sd == 0.0:      # θ is held

@@ -23,7 +23,7 @@ b divided by the spectrum of b, in the band of the oscillation. A soft-torque co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil, inf, pi, sqrt
 
@@ -100,6 +100,8 @@ class SurfaceRecord:
     """First-order time constant of the reported speed."""
     torque_lag_s: float = 0.0
     """First-order time constant of the reported torque."""
+    scale_ends: tuple[float, float] = (1.0, 1.0)
+    """Both ends of the interval of the torque scale, as factors. J has the same scale error."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,8 @@ class Severity:
     """Total time in which the string turns and its downhole speed is known."""
     mean_rad_s: float
     index: Interval
-    """Median severity index of all windows, or of the windows in stick-slip if there are any. The interval is over J
-    and the string's tolerances."""
+    """Median severity index of all windows, or of the windows in stick-slip if there are any. The interval is over J,
+    the torque scale and the string's tolerances."""
     index_worst: float
     """Severity index that 5 % of the windows exceed."""
     stick_slip_share: float
@@ -169,7 +171,7 @@ class Severity:
     downhole_rad_s: Interval
     """Half of the peak-to-peak downhole speed, median of the same windows as ``index``."""
     torque_nm: Interval
-    """Half of the peak-to-peak string torque, median of the same windows as ``index``. The interval is over J."""
+    """Half of the peak-to-peak string torque, median of the same windows as ``index``; over J and the torque scale."""
     window_s: float
     """Length of a window: one period of the string's lowest mode."""
     reflection: ReflectionCheck | None
@@ -236,10 +238,12 @@ def severity(
                   for end in (inertia.low, inertia.high)]
     by_string = [[medians([_windows(one, end, inertia.value, period, step) for one in stretches]) for end in pair]
                  for pair in string_ends(string)]
+    by_scale = [[medians([_windows(replace(one, torque=end * one.torque), string, end * inertia.value, period, step)
+                          for one in stretches]) for end in record.scale_ends]]
     index_of, swing, torque = (
         in_squares(Interval(value[at], min(value[at], *(one[at] for one in by_inertia)),
                             max(value[at], *(one[at] for one in by_inertia))),
-                   [[one[at] for one in pair] for pair in by_string] if at < 2 else [])
+                   [[one[at] for one in pair] for pair in (by_scale + by_string if at < 2 else by_scale)])
         for at in range(3))
     speed = np.concatenate([one.speed for one in stretches])
     times = np.concatenate([one.time_s for one in stretches])

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from profiles import MessageCode
 from tdhil.calibration import BodyRun, CalibrationCase, calibrate_torque, plan_bodies
 from tdhil.errors import UsageError
 from tdhil.estimation import Verdict, worst_share
@@ -43,6 +44,18 @@ def test_the_difference_of_two_runs_follows_the_closed_formulas():
     assert found.inertia_kg_m2.value == pytest.approx(52.0 * 100.0 / 50.0)
     share = hypot((1.0 + 104.0 / 52.0) * sqrt(2.0) * 0.002, 0.1 / 52.0)
     assert found.inertia_kg_m2.standard_uncertainty == pytest.approx(104.0 * share, rel=1e-9)
+
+
+@pytest.mark.parametrize(("stated", "scale_rel_sd", "warned"), [(62.7, 0.02, True), (62.7, 0.08, False),
+                                                                (56.0, 0.02, False), (50.0, 0.02, True)])
+def test_a_body_that_contradicts_the_stated_torque_scale_gives_a_warning(stated, scale_rel_sd, warned):
+    """The body has 55 kg·m². A factor of 1.14 with a scale of ±4 % was valid without a warning."""
+    found = calibrate_torque(case([104.0, 159.0], [0.0, stated], noise=5e-4, scale_rel_sd=scale_rel_sd))
+    assert found.verdict is Verdict.VALID
+    assert [one.entry for one in found.warnings] == [MessageCode.FACTOR_UNLIKE_SCALE] * warned
+    if stated == 62.7 and warned:
+        assert found.warnings == ("the factor differs from 1 by 14 %, and the stated torque scale allows ±4.0 %."
+                                  " Check the inertia of the body, or the stated scale",)
 
 
 @pytest.mark.heavy
@@ -203,6 +216,27 @@ def test_repeated_mounting_does_not_reduce_the_uncertainty_of_a_body(runs):
     assert len(of_body) == 1 and of_body[0].of_factor == pytest.approx(0.01, rel=1e-3)
     squares = sqrt(sum(line.of_factor**2 for line in found.budget))
     assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
+
+
+@pytest.mark.parametrize("bodies", [2, 5])
+def test_more_bodies_do_not_reduce_the_error_that_they_share(bodies):
+    """One balance and one gauge measure all bodies: 1 % of each is 1 % of κ. It was 0.45 % with five bodies."""
+    added = [0.0, *(55.0 * (k + 1) for k in range(bodies))]
+    found = calibrate_torque(case([104.0 + body for body in added], added, noise=1e-4, sds=[0.01 * b for b in added]))
+    assert found.factor.standard_uncertainty >= 0.01 * found.factor.value
+    (line,) = (line for line in found.budget if line.source.startswith("bodies of run 1, run 2"))
+    assert line.of_factor == pytest.approx(0.01, rel=1e-3)
+    squares = sqrt(sum(line.of_factor**2 for line in found.budget))
+    assert squares * found.factor.value == pytest.approx(found.factor.standard_uncertainty, rel=1e-6)
+
+
+def test_a_body_has_an_own_error_beyond_the_shared_one():
+    found = calibrate_torque(case([104.0, 159.0, 214.0], [0.0, 55.0, 110.0], noise=1e-4, sds=[0.0, 0.11, 1.1]))
+    lines = {line.source: line.standard_uncertainty_kg_m2 for line in found.budget if line.source.startswith("bod")}
+    assert lines == {"bodies of run 1, run 2": pytest.approx(0.22), "body of run 2, own error": pytest.approx(
+        sqrt(1.1**2 - 0.22**2))}
+    squares = sqrt(sum(line.of_inertia**2 for line in found.budget))
+    assert squares * found.inertia_kg_m2.value == pytest.approx(found.inertia_kg_m2.standard_uncertainty, rel=1e-6)
 
 
 def test_a_common_relative_error_is_in_the_factor_and_cancels_in_j():

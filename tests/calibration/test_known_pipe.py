@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from profiles import MessageCode
 from tdhil.calibration import KnownPipe, PipeInput, calibrate_known_pipe
 from tdhil.estimation import MeasuredString
 from tdhil.estimation.frequency_domain import string_view
@@ -88,6 +89,13 @@ def test_what_no_torque_scale_can_be_is_refused():
     pipe = known(0.01)
     assert calibrate_known_pipe(pipe, measured(pipe.value)).refusal == ""
     assert "no error of a torque scale" in calibrate_known_pipe(pipe, measured(1.4 * pipe.value)).refusal
+
+
+def test_a_factor_that_contradicts_the_stated_scale_gives_a_warning():
+    pipe = known(0.01)
+    assert calibrate_known_pipe(pipe, measured(1.02 * pipe.value)).warnings == ()
+    (warning,) = calibrate_known_pipe(pipe, measured(1.1 * pipe.value)).warnings
+    assert warning.entry is MessageCode.FACTOR_UNLIKE_SCALE and "Check the sizes of the pipe" in warning
 
 
 @pytest.mark.parametrize("section", [{"length_m": None, "stiffness_nm_rad": 414.0}, None])

@@ -10,8 +10,9 @@ from tdhil.calibration import MeasuredValue, TorquePairs, calibrate_pairs, line_
 from tdhil.cli import calibrate_reference
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
+from tdhil.report import factor_report
 from tdhil.report.calibration_page import band_of, quantity
-from tdhil.session import RunRecord, read_pairs
+from tdhil.session import RunRecord, load_calibration, read_pairs
 from tests.estimation.reporting import recorded
 
 
@@ -93,7 +94,33 @@ def test_torques_at_the_main_shaft_are_divided_by_the_gear_ratio(tmp_path, capsy
     log = RunRecord(recording, {}, str(log_path))
     monkeypatch.setattr(calibrate_reference, "_one_log", lambda *_: log)
     assert main([*words[:2], str(log_path), *words[2:]]) == 0
-    assert json.loads(capsys.readouterr().out)["calibration_factor"]["value"] == pytest.approx(0.95)
+    document = json.loads(capsys.readouterr().out)
+    assert document["calibration_factor"]["value"] == pytest.approx(0.95)
+    assert "TDH-065" in document["warning_codes"]            # the gear loses torque, and this is in the factor
+    with path.open("a") as file:
+        file.write("".join(f"{x},0.1,{1.1 * 0.95 * x},0.1,down\n" for x in (0, 50, 100, 200)))
+    for at, warned in (("main", False), ("motor", False)):
+        assert main([*words[:2], str(log_path), "--pairs", str(path), "--at", at, "--json"]) == 0
+        assert ("TDH-065" in json.loads(capsys.readouterr().out)["warning_codes"]) is warned
+
+
+def test_the_date_of_the_calibration_is_that_of_the_log(tmp_path, capsys, monkeypatch):
+    """The date was that of the command, so a calibration from old pairs never exceeded calibration_valid_days."""
+    path, log_path, saved = (tmp_path / name for name in ("pairs.csv", "run.mcap", "calibration.json"))
+    path.write_text(HEADER + "".join(f"{x},0.1,{0.99 * x},0.1,up\n" for x in (0, 50, 100, 200)))
+    log_path.write_bytes(b"of which only the hash is read")
+    recording = recorded(np.arange(10.0), np.ones(10), np.ones(10), torque_scale_rel_sd=0.02)
+    log = RunRecord(recording, {"started": "2020-03-01T08:00:00+00:00"}, str(log_path))
+    monkeypatch.setattr(calibrate_reference, "_one_log", lambda *_: log)
+    assert main(["calibrate", "torque", str(log_path), "--pairs", str(path), "--save", str(saved)]) == 0
+    assert load_calibration(saved)["date"] == "2020-03-01T08:00:00+00:00"
+    capsys.readouterr()
+    assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
+    undated = capsys.readouterr().out
+    assert json.loads(undated)["date"] is None
+    (tmp_path / "undated.json").write_text(undated)
+    with pytest.raises(UsageError, match="holds no date"):
+        load_calibration(tmp_path / "undated.json")
 
 
 def test_the_band_of_few_pairs_has_their_coverage_factor():
@@ -139,6 +166,22 @@ def test_the_command_prints_a_card_and_a_document(tmp_path, capsys):
     assert document["calibration_factor"]["value"] == pytest.approx(0.95)
     assert main(["calibrate", "torque", "--pairs", str(path), "--added", "5"]) == 2
     assert main(["calibrate", "torque", "--pairs", str(path), "--save", str(tmp_path / "c.json")]) == 2
+
+
+def test_pairs_that_contradict_the_stated_scale_give_a_warning_with_its_code(tmp_path, capsys):
+    path = tmp_path / "pairs.csv"
+    path.write_text(HEADER + "".join(f"{x},0.1,{0.9 * x},0.1,up\n" for x in (0, 50, 100, 200)))
+    assert main(["calibrate", "torque", "--pairs", str(path)]) == 0
+    card = " ".join(capsys.readouterr().out.replace("│", "").split())
+    assert "the factor differs from 1 by 10 %, and the stated torque scale allows ±4.0 %. Check the reference" in card
+    assert "[TDH-064]" in card
+    assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["warning_codes"][0] == "TDH-064"
+    assert any("[TDH-064]" in one for one in factor_report(document).warnings)
+    path.write_text(HEADER + "".join(f"{x},0.1,{0.97 * x},0.1,up\n" for x in (0, 50, 100, 200)))
+    assert main(["calibrate", "torque", "--pairs", str(path), "--json"]) == 0
+    assert "TDH-064" not in json.loads(capsys.readouterr().out)["warning_codes"]
 
 
 @pytest.mark.parametrize("many", [8, 80])

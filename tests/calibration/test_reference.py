@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from profiles import TdhilError
+from profiles import MessageCode, TdhilError
 from tdhil.calibration import TorqueRecord, calibrate_reference
 from tdhil.cli.main import main
 from tdhil.errors import CsvUnusable
@@ -70,6 +70,11 @@ def test_the_interval_covers(runs):
             continue
         covered.append(found.factor.low <= bench.factor <= found.factor.high)
     assert len(covered) >= 0.95 * runs and np.mean(covered) >= 0.93
+
+
+@pytest.mark.parametrize(("factor", "codes"), [(0.88, [MessageCode.FACTOR_UNLIKE_SCALE]), (0.98, [])])
+def test_a_factor_that_contradicts_the_stated_scale_gives_a_warning(factor, codes):
+    assert [one.entry for one in found_of(SensorBench(factor=factor)).warnings] == codes
 
 
 def shortened(record, keep):
@@ -153,6 +158,15 @@ def files(tmp_path):
         f"{t:.6f};{y / 1000.0:.6f}\n" for t, y in zip(sensor.time_s, sensor.torque_nm, strict=True)))
     return [str(tmp_path / "drive.csv"), "--reference", str(tmp_path / "sensor.csv"), "--column", "time=t:s",
             "torque=M:kNm"]
+
+
+@pytest.mark.parametrize(("at", "gear", "warned"), [("main", "2", True), ("main", "1", False), ("motor", "2", False)])
+def test_a_sensor_behind_a_gear_gives_a_warning(files, capsys, at, gear, warned):
+    """A gear with an efficiency of 0.96 gave κ = 0.960 ± 0.006 without a warning."""
+    main(["calibrate", "torque", *files, "--at", at, "--gear", gear, "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert ("TDH-065" in document["warning_codes"]) is warned
+    assert any("the loss of the gear is in the factor" in one for one in document["warnings"]) is warned
 
 
 @pytest.mark.heavy

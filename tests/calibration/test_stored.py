@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from drivers import PreflightRefused
+from profiles import MessageCode
 from tdhil.errors import UsageError
 from tdhil.session import (
     conclude,
@@ -16,7 +17,7 @@ from tdhil.session import (
     save_calibration,
     with_calibration,
 )
-from tdhil.session.stored_calibration import refuse_another_drive
+from tdhil.session.stored_calibration import apply_calibration, refuse_another_drive
 from tests.calibration.bodies import IDENTITY, INERTIA, SCALE, recording, two
 
 
@@ -92,6 +93,66 @@ def test_another_drive_is_refused_before_motion_and_never_calibrated(document):
     found = concluded.identification
     assert found.inertia.value == pytest.approx(SCALE * INERTIA, rel=0.01)
     assert any("not applied" in warning and "serial" in warning for warning in found.warnings)
+
+
+MODBUS = {"vendor": 0, "product": 0, "revision": 0, "serial": 0, "name": "drive", "simulated": False}
+FACTOR = {"value": 1.08, "low": 1.07, "high": 1.09, "confidence": 0.95}
+
+
+def stored(drive=MODBUS, profile="danfoss/fc302", simulated=False):
+    return {"kind": "torque_calibration", "calibration_factor": FACTOR, "date": "2026-11-23T10:00:00+00:00",
+            "drive": drive, "settings": {"profile": profile}, "simulated": simulated}
+
+
+def both(document, drive, profile, simulated):
+    """Return the refusal before motion, '' without one, and the calibration that is applied after the run."""
+    identity = {**drive, "simulated": simulated}
+    run = {"identity": identity, "profile": {"name": profile}, "torque_calibration": document}
+    refusal = ""
+    try:
+        refuse_another_drive(run, identity)
+    except PreflightRefused as error:
+        refusal = str(error)
+    return refusal, apply_calibration(replace(recording(0.0, 7), simulated=simulated), run)
+
+
+@pytest.mark.parametrize(("document", "drive", "profile", "simulated", "words"), [
+    (stored(), MODBUS, "generic/modbus", True, "this drive is simulated"),
+    (stored(), MODBUS, "danfoss/fc302", True, "this drive is simulated"),
+    (stored(simulated=True), MODBUS, "danfoss/fc302", False, "on a simulated drive"),
+    (stored(), MODBUS, "abb/acs880_modbus", False, "its profile is danfoss/fc302, and abb/acs880_modbus here"),
+    (stored(IDENTITY, "generic/cia402"), {**IDENTITY, "product": 403}, "generic/cia402", False, "its product is 402"),
+    (stored({**IDENTITY, "product": 0}, "own"), IDENTITY, "generic/cia402", False, "its profile is own"),
+])
+def test_the_calibration_of_another_drive_or_of_the_simulator_is_refused(document, drive, profile, simulated, words):
+    """A drive on Modbus reports no identity: only its profile and the simulator's marker distinguish it."""
+    refusal, applied = both(document, drive, profile, simulated)
+    assert words in refusal
+    assert applied.day == "" and words in applied.warnings[0]
+    assert applied.warnings[0].entry is MessageCode.CALIBRATION_WARNING
+
+
+@pytest.mark.parametrize(("document", "drive", "profile", "codes"), [
+    (stored(), MODBUS, "danfoss/fc302", [MessageCode.CALIBRATION_UNCHECKED]),
+    (stored({}), IDENTITY, "danfoss/fc302", [MessageCode.CALIBRATION_UNCHECKED]),
+    (stored({**IDENTITY, "serial": 0}), IDENTITY, "danfoss/fc302", [MessageCode.CALIBRATION_UNCHECKED]),
+    (stored(IDENTITY), IDENTITY, "danfoss/fc302", []),
+    (stored(IDENTITY), IDENTITY, "./copy-of-it", [MessageCode.CALIBRATION_WARNING]),
+    ({**stored(), "own_log": True}, MODBUS, "danfoss/fc302", []),
+])
+def test_a_drive_that_cannot_be_compared_gives_a_warning(document, drive, profile, codes):
+    """The own copy of a profile has another name, and the same vendor and product number."""
+    refusal, applied = both(document, drive, profile, simulated=False)
+    assert refusal == "" and applied.day == "2026-11-23"
+    assert [one.entry for one in applied.warnings] == codes
+
+
+def test_a_result_repeats_the_warning_of_its_calibration():
+    document = {**stored(IDENTITY), "warnings": ["the factor differs from 1 by 13 %", "assumed"],
+                "warning_codes": ["TDH-064", "TDH-020"]}
+    _, applied = both(document, IDENTITY, "danfoss/fc302", simulated=False)
+    assert [one.entry for one in applied.warnings] == [MessageCode.FACTOR_UNLIKE_SCALE]
+    assert "has a warning: the factor differs from 1 by 13 %" in applied.warnings[0]
 
 
 @pytest.mark.heavy

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from math import sqrt
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from tdhil.cli.main import main
 from tdhil.errors import MessageCode
 from tdhil.soft_torque import reflection_at
-from tests.cli.test_tune import result
+from tests.cli.test_tune import estimate, result
 from tests.soft_torque.cases import DRIVE, SOFT_035, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
@@ -49,6 +50,30 @@ def test_one_record(bench, capsys):
     # ω_b = τ/ζ sin ΩT, by hand
     assert found["downhole_swing_rpm"]["value"] == pytest.approx(
         5600.0 / 296.5 * np.sin(2.0 * np.pi / 8.16 * 0.944) * 30.0 / np.pi, rel=0.05)
+
+
+def test_a_calibrated_result_calibrates_the_record_once(bench, capsys):
+    """J of a calibrated result is in true kg·m², and the record in the drive's own N·m: half-swings were 5 % wrong."""
+    swings = {}
+    for name, factor, inertia in (("true", 1.0, 15.0), ("calibrated", 0.95, 0.95 * 15.0)):
+        (bench / "result.json").write_text(json.dumps(result(
+            inertia_kg_m2=estimate(inertia, 0.99 * inertia, 1.01 * inertia), torque_scale_rel_sd=0.0,
+            torque_calibration={"factor": factor, "rel_sd": 0.0})), encoding="utf-8")
+        swings[name] = json.loads(ran(bench, capsys, "--json")[1])["records"][0]["string_torque_swing_nm"]["value"]
+    assert swings["calibrated"] == pytest.approx(0.95 * swings["true"], rel=1e-9)
+
+
+def test_the_torque_scale_is_in_the_interval_of_torque_and_downhole_speed(bench, capsys):
+    found = []
+    for rel_sd in (0.0, 0.02):
+        (bench / "result.json").write_text(json.dumps(result(torque_scale_rel_sd=rel_sd)), encoding="utf-8")
+        found += json.loads(ran(bench, capsys, "--json")[1])["records"]
+    for name in ("string_torque_swing_nm", "downhole_swing_rpm"):
+        exact, wide = (one[name] for one in found)
+        assert wide["value"] == exact["value"]
+        for end in ("low", "high"):
+            added = sqrt((wide[end] - wide["value"]) ** 2 - (exact[end] - exact["value"]) ** 2)
+            assert added == pytest.approx(1.96 * 0.02 * wide["value"], rel=0.05), (name, end)
 
 
 def test_the_printed_intervals_contain_those_of_the_document(bench, capsys):

@@ -169,6 +169,14 @@ MODBUS_TCP = ("--host", "127.0.0.1", "--port")
 HUB = ("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1")
 
 
+def test_without_an_address_it_says_that_nothing_was_sent():
+    done = tdhil("stop")
+    text = done.err.replace("\n", " ")
+    assert done.code == 2
+    assert "nothing was sent, and the shaft may still turn" in text and "hard-wired emergency stop" in text
+    assert "tdhil stop --rig rig.yaml" in text
+
+
 @pytest.mark.parametrize("dead", ["closed Modbus port", "silent Modbus host", "closed hub", "hub that says nothing",
                                   "no serial device"])
 @pytest.mark.parametrize("as_json", [

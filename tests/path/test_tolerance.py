@@ -7,7 +7,7 @@ from tdhil.cli.arguments import amount, share
 from tdhil.recording import LogTail
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import QUICK, Shaft, identify, tdhil
-from tests.rigs import rig_file
+from tests.rigs import limits_text, rig_file
 
 
 def half_width(document):
@@ -97,8 +97,21 @@ def test_a_dry_run_is_readable_in_80_columns(monkeypatch):
     done = tdhil("identify", "--dry-run", "--tolerance", "2%")
     assert done.code == 0
     assert max(map(len, done.out.splitlines())) <= 80
-    for wanted in ("DRY RUN", "nothing moves", "assumed", "expected interval of J", "±400", "rad/s", "pilot"):
+    for wanted in ("DRY RUN", "nothing moves", "assumed", "expected interval of J", "±400", "rad/s", "pilot",
+                   "is assumed from the limits"):
         assert wanted in done.out
+
+
+def test_a_plan_ends_before_the_time_limit_or_is_refused(tmp_path):
+    """A run used to turn the shaft through stages 1 to 4 first, and the guard then ended stage 5."""
+    short, shorter = (rig_file(tmp_path, limits_text(time_s=time_s), name=f"{time_s}.yaml") for time_s in (300.0, 75.0))
+    done = tdhil("identify", "--simulate", "--dry-run", "--rig", short, "--max-time", "1h", "--json")
+    assert done.document["duration_s"] <= 300.0 - 90.0
+    done = tdhil("identify", "--simulate", "--dry-run", "--rig", short, "--periods", 30)
+    assert done.code == 4 and "are left of limits.time_s" in done.err.replace("\n", " ")
+    done = tdhil("identify", "--simulate", "--rig", shorter, "--log", tmp_path / "run.mcap")
+    assert done.code == 4 and "75 s are too short" in done.err.replace("\n", " ")
+    assert "stage speed" not in done.err
 
 
 def test_a_dry_run_refuses_what_a_run_would_refuse(tmp_path, monkeypatch):

@@ -92,6 +92,9 @@ def test_string_and_inertia_widen_the_interval():
     assert wide.rms_nm.low < narrow.rms_nm.low < narrow.rms_nm.high < wide.rms_nm.high
     assert wide.rms_nm.low < 200.0 < wide.rms_nm.high
     assert 0.0 < wide.report_share < 0.1 and wide.segments >= 20
+    scaled = bit_noise_in(replace(whole, scale_ends=(0.8, 1.2)), EXACT, EXACT_J).rms_nm
+    assert scaled.value == narrow.rms_nm.value
+    assert scaled.low < 0.85 * scaled.value and 1.15 * scaled.value < scaled.high
 
 
 def test_unsuitable_records_are_refused_with_a_reason():
