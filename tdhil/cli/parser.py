@@ -57,9 +57,8 @@ class CommandParser(argparse.ArgumentParser):
         """Raise UsageError with the message of argparse, and the choices of missing options."""
         before, required, names = message.partition("arguments are required: ")
         if required:
-            values = {"/".join(one.option_strings): f" {'|'.join(map(str, one.choices))}"
-                      for one in self._actions if one.choices}
-            message = before + required + ", ".join(name + values.get(name, "") for name in names.split(", "))
+            told = {"/".join(a.option_strings): f" {'|'.join(map(str, a.choices))}" for a in self._actions if a.choices}
+            message = before + required + ", ".join(name + told.get(name, "") for name in names.split(", "))
         of_a_value = message.startswith("argument -") and ": expected " not in message
         entry = MessageCode.VALUE_NOT_ALLOWED if of_a_value or ": invalid " in message else MessageCode.USAGE
         raise self._refusal(message, entry)

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 
 _NARROW = 72          # columns; a narrower table is without the watchdog
-_LEAST = 56           # columns that the names need
 _SHOW = ("torque: the drive has a torque mode. V/L/U: number of entries that are verified, likely, unverified. *: "
          "experimental.\ntdhil profiles show NAME shows what to set at the drive and what to look up in its manual.")
 
@@ -193,16 +192,15 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
 
     console = _console()
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for heading in ("profile", "bus", "torque", "V/L/U"):
-        table.add_column(heading, no_wrap=True)
-    if wide := console.width >= _NARROW:
-        table.add_column("watchdog")
+    columns = ("profile", "bus", "torque", "V/L/U", "watchdog")[:5 if console.width >= _NARROW else 4]
+    for heading in columns:
+        table.add_column(heading, no_wrap=heading != "watchdog")
     for profile in profiles:
         sure = "/".join(map(str, counts(profile).values())) + ("*" if profile.experimental else "")
         watchdog = watchdog_text(profile).replace(", then ", " → ").replace("the drive would keep", "keeps")
-        table.add_row(profile.name, profile.bus, "yes" if profile.can_torque else "no", sure,
-                      *((watchdog,) if wide else ()))
-    console.width = max(console.width, _LEAST)
+        cells = (profile.name, profile.bus, "yes" if profile.can_torque else "no", sure, watchdog)
+        table.add_row(*cells[:len(columns)])
+    console.width = max(console.width, 56)        # the names need as much
     console.print(table)
     console.print(_SHOW)
     return 0
