@@ -83,7 +83,7 @@ class SteppedClock:
 # Ticks of the cycle: the start of each cycle, its delay, and delays of this loop itself.
 
 
-LOWER_THE_RATE = "Lower --rate, or give --real-time-priority"
+LOWER_THE_RATE = "Close other programs, add --real-time-priority, or lower --rate"
 """Advice if this computer, or its adapter, is too slow."""
 
 SWITCH_S = 0.0005
@@ -99,7 +99,7 @@ STALL_S, STALL_CYCLES = 0.05, 3.0
 
 
 def how_late(late_s: Iterable[float], period_s: float) -> str:
-    """Return `host or adapter late (n of m cycles, p99 …)`, or an empty text if few of these cycles were late.
+    """Return the number of late cycles and the cause as text, or an empty text if few of these cycles were late.
 
     ``late_s``: delay of the start of each cycle, or of each answer after its cycle, s.
     """
@@ -108,7 +108,8 @@ def how_late(late_s: Iterable[float], period_s: float) -> str:
     if late <= LATE_SHARE * len(ordered):
         return ""
     p99_s = quantile(ordered, 0.99)
-    return f"host or adapter late ({late} of {len(ordered)} cycles, p99 {1e3 * p99_s:.3g} ms)"
+    return (f"{late} of the last {len(ordered)} cycles were late (99 % of all by at most {1e3 * p99_s:.3g} ms): the"
+            " computer or the adapter is too slow")
 
 
 def quantile(ordered: list[float], share: float) -> float:

@@ -200,6 +200,34 @@ def printed_interval(low: float, high: float, digits: int = 4, sign: bool = Fals
     return " to ".join(f"{'+' if sign and not one.startswith('-') else ''}{one}" for one in ends)
 
 
+def in_rad_s_and_rpm(*speeds_rad_s: float) -> str:
+    """Return a speed, or a range of two, in both units: ``0.5 to 10 rad/s (4.77 to 95.5 rpm)``."""
+    radians, turns = (" to ".join(plain_number(unit.of_si(one), 3) for one in speeds_rad_s) for unit in (SPEED, RPM))
+    return f"{radians} rad/s ({turns} rpm)"
+
+
+def rpm_advice(value: float, flag: str, low: float, high: float) -> str:
+    """Return the advice for a speed in rad/s that was probably meant in rpm, and would fit between two speeds."""
+    typed = plain_number(value)
+    fits = low <= RPM.si(value) <= high and float(typed) == value
+    return f"If you meant rpm, write {flag} {typed}rpm. Otherwise change" if fits else "Change"
+
+
+def share_advice(value: float) -> str:
+    """Return the advice for a share that was probably meant in percent; '' for any other value."""
+    if not 1.0 <= value <= 100.0:
+        return ""
+    return f"{value:g} means {100.0 * value:g} %. For {value:g} % write {value:g}% or {PERCENT.si(value):g}"
+
+
+_SMALLEST: Final = 1e-6
+
+
+def excludes_zero(limit: float, value: float) -> bool:
+    """Return whether the lowest permitted value only excludes 0, and ``value`` is not positive."""
+    return 0.0 < limit <= _SMALLEST and value <= 0.0
+
+
 def in_nm(torque_nm: float) -> str:
     """Return a torque with its unit, for a message: ``1143 N·m``, ``0.2133 N·m``. A servo drive has 1 N·m or less."""
     return f"{plain_number(torque_nm)} N·m"

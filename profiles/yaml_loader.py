@@ -163,7 +163,7 @@ def _explain(
         said = next((f" ({field.description})" for field in known_fields if field.description), "")
         yield path, tree.line(path), f"'{key}' is missing{said}"
     else:
-        said = _wrong_value(item, _value(tree.data, path), tree.written.get(path))
+        said = _wrong_value(item, _value(tree.data, path), tree.written.get(path), str(path[-1]) if path else "")
         yield path, tree.value_lines.get(path, tree.line(path)), said
 
 
@@ -175,14 +175,20 @@ def _wanted(kinds: list[str], tree: Tree, path: KeyPath) -> str:
     return f"must be {wanted}, not {_shown(value)}{_advice(kinds[0], value, path)}"
 
 
-def _wrong_value(item: dict[str, Any], value: Any, written: str | None) -> str:
+def _wrong_value(item: dict[str, Any], value: Any, written: str | None, key: str) -> str:
     kind, context = item["type"], item.get("ctx", {})
     if kind in {"literal_error", "enum"}:
         choices = [choice.strip("' ") for choice in context["expected"].replace(" or ", ", ").split(",")]
         return f"must be {context['expected']}, not {_shown(value)}{_meant(str(value), choices, listed=False)}"
     if kind in _BOUNDS:
-        as_written = f"{value:.4g} ({_clean(written)})" if written else ""
-        return f"must be {_BOUNDS[kind][1]} {context[_BOUNDS[kind][0]]:g}, not {as_written or _shown(value)}"
+        name, words = _BOUNDS[kind]
+        bound = context[name]
+        if name == "ge" and quantities.excludes_zero(bound, value):
+            words, bound = "greater than", 0.0
+        shown = f"{value:.4g} ({_clean(written)})" if written else _shown(value).removesuffix(".0")
+        of_share = not written and name in ("lt", "le") and quantities.unit_of_key(key) == quantities.SHARE
+        advice = quantities.share_advice(value) if of_share else ""
+        return f"must be {words} {bound:g}, not {shown}" + (f"; {advice}" if advice else "")
     if kind == "string_too_short" and context["min_length"] == 1:
         return "must not be empty"
     if kind in {"too_short", "too_long"}:

@@ -116,26 +116,58 @@ def hint(text: str) -> str:
 # PyYAML's syntax errors in words for the author of the file.
 
 
+_INDENTATION = "the indentation is wrong here or in the line above. All keys of a section start in the same column"
+_COLON_IN_TEXT = "a ': ' stands inside a text; put the text in quotes"
 _WORDS = (
     (r"'\t' that cannot start", "a tab; indent and separate with spaces"),
-    ("mapping values are not allowed", "a ':' where no key can stand; mend the indentation, or put the text in quotes"),
+    ("mapping values are not allowed", _INDENTATION),
     ("could not find expected ':'", "a key without ':', or a text that runs over the line without quotes"),
+    ("but found '<block mapping start>'", _INDENTATION),
     ("expected <block end>", "the indentation does not fit the lines above"),
     ("unexpected end of stream", "a quote or bracket is opened and never closed"),
     ("expected ',' or", "a bracket is not closed, or a ',' is missing"),
     ("that cannot start any token", "a text can't begin with this character; put it in quotes"),
 )
+_LINE_END = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
+"""Ends of lines as PyYAML counts them."""
+_WITHOUT_COLON = re.compile(r"( *)([A-Za-z_]\w*)(?: +|:(?! )|$)(\S.*)?")
 
 
-def syntax_error(error: yaml.MarkedYAMLError) -> tuple[int, str]:
-    """Return the line (from 1; 0 if unknown) and the problem in plain words."""
+def syntax_error(error: yaml.MarkedYAMLError, text: str) -> tuple[int, str]:
+    """Return the line (from 1; 0 if unknown) and the problem in plain words. ``text``: what PyYAML has parsed."""
     mark = error.problem_mark or error.context_mark
-    line = int(mark.line) + 1 if mark is not None else 0
     problem = error.problem or error.context or "can't be parsed"
+    if mark is None:
+        return 0, f"not YAML: {problem}"
+    lines, line = _LINE_END.split(text), int(mark.line) + 1
+    if "could not find expected ':'" in problem and error.context_mark is not None:      # found at the next token
+        line = int(error.context_mark.line) + 1
+        if said := _no_colon(lines[line - 1]):
+            return line, said
+    elif "mapping values are not allowed" in problem:
+        here = lines[line - 1]
+        if ": " in here[: int(mark.column)]:
+            return line, _COLON_IN_TEXT
+        above = next((one for one in range(line - 2, -1, -1) if lines[one].split("#")[0].strip()), 0)
+        if _indent(lines[above]) == _indent(here) and (said := _no_colon(lines[above])):
+            return above + 1, said
     for part, words in _WORDS:
         if part in problem:
             return line, words
     return line, f"not YAML: {problem}" + (f" ({error.context})" if error.context and error.problem else "")
+
+
+def _no_colon(line: str) -> str:
+    """Return the problem of a line whose key has no ': ' behind it; '' for any other line."""
+    line = line.split(" #", maxsplit=1)[0].rstrip()
+    if ": " in line or line.endswith(":") or not (found := _WITHOUT_COLON.fullmatch(line)):
+        return ""
+    mended = _short(f"{found[2]}: {found[3] or '…'}")
+    return f"'{_short(line.strip())}' has no ': ' after the key. Write {mended}, with a space after the colon"
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip(" "))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -299,7 +331,7 @@ def read_tree(text: str, file: str) -> Tree:
     except BrokenYaml as broken:
         tree.problems.append(Problem(file, broken.line, broken.message))
     except yaml.MarkedYAMLError as error:
-        tree.problems.append(Problem(file, *syntax_error(error)))
+        tree.problems.append(Problem(file, *syntax_error(error, text)))
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         # PyYAML passes escapes such as "\UFFFFFFFF" to chr() without a check.
         line = loader.line + 1 if loader is not None else 0

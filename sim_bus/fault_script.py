@@ -12,6 +12,7 @@
 import re
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
 from math import inf
 from textwrap import fill
@@ -266,7 +267,10 @@ class Kinds(dict[str, FaultKind[M]]):
         kind = self.get(fault.name)
         where = f"--fault {fault.text or fault.name}"
         if kind is None:
-            raise FaultRefused(f"no fault is called {fault.name!r}", where=where, next_step="--fault list shows them")
+            close = get_close_matches(fault.name[:80], self, n=1)
+            hint = f"Did you mean {close[0]!r}? " if close else ""
+            raise FaultRefused(f"no fault is called {fault.name!r}", where=where,
+                               next_step=f"{hint}--fault list shows them")
         if fault.value and not kind.takes:
             raise FaultRefused(f"{fault.name} takes no value", where=where, next_step="Leave the = out")
         if (at := fault.value.partition("@"))[1]:
@@ -299,7 +303,8 @@ class Kinds(dict[str, FaultKind[M]]):
         wrap = partial(fill, width=width, break_long_words=False, break_on_hyphens=False)
         lines = [
             wrap(f"NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: {', '.join(_MOMENTS)}, hold+2s"),
-            "", f"{'row':>3}  {'name':<37}what happens",
+            "", wrap("row: number of the row in docs/reference/faults.md, with the required reaction"),
+            f"{'row':>3}  {'name':<37}what happens",
         ]
         for one in self.listed():
             shown = f"{one.name}[={one.value}]" if one.takes else one.name

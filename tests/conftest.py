@@ -157,7 +157,7 @@ def no_bus_of_the_user(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 STOOD_STILL_S = 0.5
-LATE = ("stood still for", "host or adapter late", "host was silent for too long")
+LATE = ("stood still for", "the computer or the adapter is too slow", "host was silent for too long")
 """Texts in the message of a late run (drivers)."""
 TRIES = 4
 

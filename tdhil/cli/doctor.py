@@ -108,7 +108,7 @@ def disk_finding(log: Path) -> DoctorFinding:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         return bad("disk", f"{folder}: {error.strerror or error}", "Make that folder, or log elsewhere with --log")
-    text = f"{free / 1e6:.0f} MB free for {log}"
+    text = f"{free / 1e9:.0f} GB free for {log}" if free >= 1e10 else f"{free / 1e6:.0f} MB free for {log}"
     if free >= WANTED_FREE_BYTES:
         return ok("disk", text)
     return bad("disk", f"{text}, {WANTED_FREE_BYTES / 1e6:.0f} MB required", "Free disk space, or log to another disk")

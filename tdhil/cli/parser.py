@@ -27,6 +27,7 @@ class CommandParser(argparse.ArgumentParser):
         self._rare: list[argparse.Action] = []
         self.usual_action = ""
         """Default action of a command with several actions."""
+        self.also_called: Mapping[str, str] = {}       # other words for an action, for the suggestion
 
     def set_rare(self, rare: list[argparse.Action]) -> None:
         """Hide these options from ``--help``, and add ``--help-all``."""
@@ -53,7 +54,11 @@ class CommandParser(argparse.ArgumentParser):
         return super().format_help()
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError with the message of argparse."""
+        """Raise UsageError with the message of argparse, and the choices of missing options."""
+        before, required, names = message.partition("arguments are required: ")
+        if required:
+            told = {"/".join(a.option_strings): f" {'|'.join(map(str, a.choices))}" for a in self._actions if a.choices}
+            message = before + required + ", ".join(name + told.get(name, "") for name in names.split(", "))
         of_a_value = message.startswith("argument -") and ": expected " not in message
         entry = MessageCode.VALUE_NOT_ALLOWED if of_a_value or ": invalid " in message else MessageCode.USAGE
         raise self._refusal(message, entry)
@@ -69,7 +74,8 @@ class CommandParser(argparse.ArgumentParser):
             if not args or args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
                 word = args[0] if args else "-"
                 # the default action would take a misspelt action as a file
-                if not word.startswith("-") and (hint := meant(word, actions.choices)) and not Path(word).exists():
+                if not word.startswith("-") and (
+                        hint := meant(self.also_called.get(word, word), actions.choices)) and not Path(word).exists():
                     raise self._refusal(f"there is no action {word[:40]}", MessageCode.USAGE, hint)
                 args = [self.usual_action, *args]
         found, unknown = super().parse_known_args(args, namespace)

@@ -42,8 +42,9 @@ if TYPE_CHECKING:
 # `tdhil profiles show`: all information needed at the drive, on the terminal.
 
 
-_NARROW = 72          # columns; a narrower table of five would lose whole columns
-_SHOW = "tdhil profiles show NAME shows what to set at the drive and what to look up in its manual."
+_NARROW = 72          # columns; a narrower table is without the watchdog
+_SHOW = ("torque: the drive has a torque mode. V/L/U: number of entries that are verified, likely, unverified. *: "
+         "experimental.\ntdhil profiles show NAME shows what to set at the drive and what to look up in its manual.")
 
 
 def show(profile: Profile, console: Console) -> None:
@@ -190,22 +191,16 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
     from rich.table import Table
 
     console = _console()
-    if console.width < _NARROW:
-        for profile in profiles:
-            said = row(profile)
-            sure = sure_text(profile) + (", experimental" if said["experimental"] else "")
-            console.print(f"{said['name']}: {said['bus']}; {said['modes']}; {said['watchdog']}; {sure}")
-        console.print(_SHOW)
-        return 0
-    table = Table(expand=False)
-    for heading in ("profile", "bus", "modes"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("watchdog", "confidence"):
-        table.add_column(heading, overflow="fold")
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    columns = ("profile", "bus", "torque", "V/L/U", "watchdog")[:5 if console.width >= _NARROW else 4]
+    for heading in columns:
+        table.add_column(heading, no_wrap=heading != "watchdog")
     for profile in profiles:
-        said = row(profile)
-        sure = sure_text(profile) + (", experimental" if said["experimental"] else "")
-        table.add_row(said["name"], said["bus"], said["modes"], said["watchdog"], sure)
+        sure = "/".join(map(str, counts(profile).values())) + ("*" if profile.experimental else "")
+        watchdog = watchdog_text(profile).replace(", then ", " → ").replace("the drive would keep", "keeps")
+        cells = (profile.name, profile.bus, "yes" if profile.can_torque else "no", sure, watchdog)
+        table.add_row(*cells[:len(columns)])
+    console.width = max(console.width, 56)        # the names need as much
     console.print(table)
     console.print(_SHOW)
     return 0

@@ -15,6 +15,7 @@ from tdhil.cli.report_file import ReportFile, add_head_options, add_report_optio
 from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.errors import MessageCode, UsageError
+from tdhil.file_kind import require_log_kind
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -97,6 +98,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
                          entry=MessageCode.LOG_NEEDED)
     for log in namespace.logs:
         require_log(log)
+        require_log_kind(log, "tdhil compare before.mcap after.mcap")
         if not namespace.archived and is_archived(log):
             raise UsageError("tdhil serve has archived this run", where=str(log),
                              next_step="Add --archived, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)

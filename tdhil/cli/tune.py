@@ -30,4 +30,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         description="Compute a speed controller that damps the drill string. tdhil tune RESULT does the same.")
     tune_soft_torque.add_arguments(string)
     if isinstance(parser, CommandParser):
-        parser.usual_action = SOFT_TORQUE
+        parser.usual_action, parser.also_called = SOFT_TORQUE, {"loop": "speed", "speed-loop": "speed"}

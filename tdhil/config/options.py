@@ -16,7 +16,20 @@ from types import MappingProxyType, NoneType, UnionType
 from typing import Any, Final, Literal, Protocol, Self, Union, get_args, get_origin, get_type_hints
 
 from drivers import own_limits
-from profiles.quantities import FREQUENCY, FRICTION, INERTIA, MINUTE, PERCENT, SHARE, SPEED, TIME, TORQUE, Unit
+from profiles.quantities import (
+    FREQUENCY,
+    FRICTION,
+    INERTIA,
+    MINUTE,
+    PERCENT,
+    SHARE,
+    SPEED,
+    TIME,
+    TORQUE,
+    Unit,
+    excludes_zero,
+    share_advice,
+)
 from tdhil.config.registry import BUSES, DEFAULT_BUS, DEFAULT_EXCITATION, EXCITATIONS, MODELS, RegistryEntry, names
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -168,7 +181,13 @@ class Option:
     def refusal(self, value: float) -> str:
         """Return the limits, as text, that a number exceeds; '' if it is within them."""
         right = all(_LIMITS[name][1](value, limit) for name, limit in self.limits.items())
-        return "" if right else " and ".join(f"{_LIMITS[name][0]} {limit:g}" for name, limit in self.limits.items())
+        if right:
+            return ""
+        said = " and ".join(
+            "greater than 0" if name == "ge" and excludes_zero(limit, value) else f"{_LIMITS[name][0]} {limit:g}"
+            for name, limit in self.limits.items())
+        advice = share_advice(value) if self.unit == SHARE else ""
+        return f"{said}. {advice}" if advice else said
 
     @property
     def form_hint(self) -> str:

@@ -41,9 +41,11 @@ from profiles import (
     one_of,
     parse_with_lines,
 )
+from profiles.quantities import plain_number
 from tdhil.config.acceptance import ACCEPTED_QUANTITIES, Expectation
 from tdhil.config.options import CLOCKS, OPTIONS, Option, Topic
 from tdhil.config.registry import BUSES, RegistryEntry, imported, names
+from tdhil.file_kind import LOG, PAGE, PDF, RESULT, kind_of
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
@@ -114,8 +116,9 @@ class Limits(DataModel):
             findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {most:g}"))
         braking = values.get("quick_stop_rad_s2")
         if highest is not None and braking is not None and highest > LONGEST_BRAKING_S * braking:
-            findings.append(("quick_stop_rad_s2", f"brakes from speed_max_rad_s in {highest / braking:.3g} s, more than"
-                             f" the limit of {LONGEST_BRAKING_S:g} s: give {highest / LONGEST_BRAKING_S:.2g} or more"))
+            findings.append(("quick_stop_rad_s2", f"brakes from speed_max_rad_s in {plain_number(highest / braking, 3)}"
+                             f" s, more than the limit of {LONGEST_BRAKING_S:g} s:"
+                             f" give {plain_number(highest / LONGEST_BRAKING_S, 2)} or more"))
         return findings
 
 
@@ -377,6 +380,8 @@ def _with_sections(buses: tuple[tuple[str, RegistryEntry], ...]) -> type[Rig]:
 
 def load_rig(path: Path) -> Rig:
     """Return the bench of a rig.yaml, in SI. Raises DataFileError with every problem and its line."""
+    if (kind := kind_of(path)) in (LOG, RESULT, PAGE, PDF):
+        raise DataFileError((Problem(str(path), 0, f"is {kind}. --rig needs rig.yaml"),))
     return _rig_of(load_with_lines(path, rig_model(), convert=True))
 
 

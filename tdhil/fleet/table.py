@@ -137,7 +137,8 @@ def read_table(path: Path) -> list[FleetRow]:
         ".parquet": _read_parquet, ".csv": _read_csv, ".sqlite": _read_sqlite,
     }
     if path.suffix not in readers or not path.is_file():
-        raise UsageError("there is no such table", where=str(path), next_step="Name one that `tdhil fleet` wrote",
+        wrong = "is not a table (.parquet, .csv or .sqlite)" if path.is_file() else "this table does not exist"
+        raise UsageError(wrong, where=str(path), next_step="Make one: tdhil fleet LOG LOG --out fleet.csv",
                          entry=MessageCode.FLEET_TABLE_WRONG)
     try:
         return [row_from_json({name: value for name, value in row.items() if name in COLUMNS})

@@ -142,7 +142,8 @@ def read_any(path: Path) -> RunRecord:
         return read(path)
     if path.suffix.lower() != ".csv":
         empty = path.stat().st_size == 0
-        raise NothingRecoverable("the file is empty" if empty else "this is not an MCAP file", where=str(path))
+        raise NothingRecoverable("the file is empty" if empty else "this is not an MCAP file", where=str(path),
+                                 next_step="Give a run.mcap of tdhil, or a trace that ends in .csv")
     from tdhil.session import stated_lags
 
     known = _known(path)

@@ -420,7 +420,7 @@ _LOOP = (
 
 
 def _opinions(document: Part) -> Iterator[Block]:
-    words = {True: "agrees", False: "does not agree", None: "nothing to compare with"}
+    words = {True: "agrees", False: "does not agree", None: "not compared: the run gives no J"}
     for one in document["second_opinions"]:
         yield Text(f"{MOMENTUM_CROSS_CHECK.capitalize()}, {one['route']}: "
                    f"{estimate_text(one['inertia_kg_m2'], 'kg·m²')}, {words[one['agrees']]}. {sentence(one['note'])}")

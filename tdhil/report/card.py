@@ -37,7 +37,8 @@ def minutes(seconds: float) -> str:
 # Small tables of the result card: uncertainty budget, cross-checks, friction over speed, a compliant shaft.
 
 
-_AGREES = {True: ("agrees", "green"), False: ("DOES NOT AGREE", "bold red"), None: ("nothing to compare with", "dim")}
+_AGREES = {True: ("agrees", "green"), False: ("DOES NOT AGREE", "bold red"),
+           None: ("not compared: the run gives no J", "dim")}
 
 _NOTHING = 1e-5           # of J: a smaller contribution is left out
 

@@ -126,7 +126,7 @@ class Guard:
         self._limited_since_s: float | None = None
         self._mode: _ModeShown | None = None
         self._following = _Following(limits, period_s, speed_resolution_rad_s, assumptions)
-        self._pace_cycles = max(10, round(PACE_S / period_s))
+        self._pace_cycles, self._rate_hz = max(10, round(PACE_S / period_s)), round(1.0 / period_s, 6)
         self._pace_from = Counters()
         self._pace_left = 0                # cycles before the next check
         self._started_s: float | None = None
@@ -219,7 +219,7 @@ class Guard:
                 f"the control loop was late in {late} of {cycles} cycles (limit {100 * LATE_SHARE:.0f} %)"
                 + (f": {words}" if words else ""),
                 where="host",
-                next_step=f"{LOWER_THE_RATE}; or end other programs on this computer",
+                next_step=f"{LOWER_THE_RATE} below {self._rate_hz:g}",
                 entry=MessageCode.HOST_LATE,
             )
 
@@ -379,11 +379,11 @@ class Guard:
     def _check_age(self, sample: Sample) -> None:
         self._stale += 1
         if self._stale >= self._stale_limit:
-            late, missing = self.host_late(), f"no feedback for {self._stale} cycles"
+            late, missing = self.host_late(), f"no feedback for {self._stale} cycles, which is the limit"
             raise CommunicationLost(
-                f"{late}; {missing}" if late else missing,
+                f"{missing}. {late}" if late else missing,
                 where=f"host, and {_at(sample)}" if late else _at(sample),
-                next_step=LOWER_THE_RATE
+                next_step=f"{LOWER_THE_RATE} below {self._rate_hz:g}"
                 if late
                 else "The drive's own watchdog stops the shaft. Check the drive's supply and the bus",
                 entry=MessageCode.FEEDBACK_LOST,

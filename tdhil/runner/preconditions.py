@@ -79,7 +79,7 @@ class RateChoice:
         if not taken.holds:
             return (
                 f"{taken.rate_hz:g} cycles per second, although this computer does not sustain them ({taken.text}; "
-                f"the limit is half a period, {500.0 / taken.rate_hz:.3g} ms). {LOWER_THE_RATE}, or end other programs"
+                f"the limit is half a period, {500.0 / taken.rate_hz:.3g} ms). {LOWER_THE_RATE}"
             )
         if taken is first:
             return f"{taken.rate_hz:g} cycles per second: this computer sustains them ({taken.text}; --rate overrides)"

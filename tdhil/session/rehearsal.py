@@ -167,8 +167,9 @@ class Rehearsal:
     @property
     def lines(self) -> tuple[str, ...]:
         """Return the rehearsal as lines for a terminal."""
+        rows = any(one.row for one in self.faults)
         return (
-            with_code(f"rehearsal: {self.verdict}", self._code),
+            with_code(f"rehearsal: {self.verdict}{' (rows of docs/reference/faults.md)' if rows else ''}", self._code),
             *(f"{one.fault}: {one.verdict}; required ({row_name(one.row)}): {one.required}" for one in self.faults),
             f"seen: {self.seen}",
         )

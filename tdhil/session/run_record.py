@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, TdhilError, UsageError
+from tdhil.file_kind import require_log_kind
 
 if TYPE_CHECKING:
     import pandas
@@ -170,6 +171,7 @@ def read(
                 raise UsageError("is for a trace in CSV; this log contains its own", where=name,
                                  entry=MessageCode.OPTION_FOR_CSV_ONLY)
         return _read_log(path)
+    require_log_kind(path, "tdhil replay run.mcap", trace=True)
     from tdhil.config import ASKED_AGAIN
     from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
     from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD

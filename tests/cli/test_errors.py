@@ -138,6 +138,7 @@ def test_an_unknown_command_is_reported_with_a_suggestion(
 
 
 @pytest.mark.parametrize(("typed", "said"), [
+    ("loop", "tdhil: tune: there is no action loop. Did you mean 'speed'? See tdhil tune --help [TDH-200]\n"),
     ("sped", "tdhil: tune: there is no action sped. Did you mean 'speed'? See tdhil tune --help [TDH-200]\n"),
     ("result.jsn", "tdhil: result.jsn: this file does not exist."),
     ("verfy", "tdhil: verfy: this file does not exist."),         # this names an existing file
@@ -150,6 +151,17 @@ def test_a_misspelt_action_is_no_file(
         (tmp_path / typed).mkdir()
     assert main(["tune", typed, *(["r.json"] if typed == "sped" else [])]) == 2
     assert capsys.readouterr().err.startswith(said)
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (("export", "first.mcap"), "export: the following arguments are required: --to candump|asc|csv|parquet. See"),
+    (("rig", "new"), "rig new: the following arguments are required: --load none|string. See tdhil rig new --help"),
+])
+def test_a_missing_option_is_stated_with_its_values(
+    words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(list(words)) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_after_a_question_there_is_no_full_stop() -> None:

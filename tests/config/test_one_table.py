@@ -142,6 +142,16 @@ def test_a_value_beyond_its_limits_is_refused_with_both(value, said):
     assert bool(said) == bool(OPTION["confidence"].refusal(value))
 
 
+@pytest.mark.parametrize(("name", "value", "said"), [
+    ("max_time", -5.0, "greater than 0 and at most 1e+07"), ("max_time", 1e-7, "at least 1e-06 and at most 1e+07"),
+    ("tolerance", 1.0, "greater than 0 and less than 1. 1 means 100 %. For 1 % write 1% or 0.01"),
+    ("tolerance", 0.0, "greater than 0 and less than 1"),
+])
+def test_a_refused_number_is_stated_with_its_meaning(name, value, said):
+    (option,) = (one for one in OPTIONS if one.flag == f"--{name.replace('_', '-')}")
+    assert option.refusal(value) == said
+
+
 def test_python_shows_its_keywords():
     run, simulate, identify = (inspect.signature(one).parameters for one in (tdhil.run, tdhil.simulate, tdhil.identify))
     assert {"drive", "motion", "confirm", "stop", "tolerance", "max_time_s", "no_watchdog", "note"} <= set(run)

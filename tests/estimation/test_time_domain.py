@@ -295,7 +295,11 @@ def test_the_interval_covers(machine, motion):
         inertia = said.inertia
         assert inertia.low <= machine.inertia <= inertia.high
         assert inertia.high - inertia.low < 0.4 * machine.inertia
-        assert {line.source for line in said.budget} >= {"noise", "lags", "lag structure", "friction model"}
+        notes = {line.source: line.note for line in said.budget}
+        assert notes.keys() >= {"noise", "lags", "lag structure", "friction model"}
+        assert notes["noise"] == "disturbance of the load and noise of both signals, for known lags"
+        assert notes["lags"] == "lags and time offset of the reported signals; none is stated"
+        assert notes["friction model"].startswith("friction with and without a term in speed²")
 
 
 @pytest.mark.heavy

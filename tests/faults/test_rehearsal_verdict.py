@@ -82,7 +82,7 @@ def test_a_refusal_that_is_required_passes_in_document_and_on_the_terminal(rehea
     assert run.done.code == ExitCode.REFUSED
     assert run.done.document["rehearsal"]["verdict"] == "pass"
     assert run.done.document["rehearsal"]["faults"][0]["row"] == 29
-    assert "tdhil: rehearsal: pass" in run.done.err
+    assert "tdhil: rehearsal: pass (rows of docs/reference/faults.md)" in run.done.err
 
 
 @pytest.mark.heavy

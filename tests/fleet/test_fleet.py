@@ -187,7 +187,8 @@ def test_every_kind_of_file_has_its_row(few, tmp_path):
     assert (rows["trace.csv"].rig, rows["trace.csv"].torque_scale_rel_sd) == ("R9", 0.02)
     assert not rows["cut.mcap"].complete
     assert {name: row.error_text for name, row in rows.items() if row.failed} == {
-        "empty.mcap": "the file is empty", "other.mcap": "this is not an MCAP file",
+        "empty.mcap": "the file is empty",
+        "other.mcap": "this is not an MCAP file. Give a run.mcap of tdhil, or a trace that ends in .csv",
         "corrupt.mcap": "an MCAP file, but not a run of this tool. Give a run.mcap of this tool",
         "wrong.csv": rows["wrong.csv"].error_text}
     assert "colour" in rows["wrong.csv"].error_text

@@ -95,8 +95,11 @@ def test_a_foreign_file_is_not_changed(tmp_path):
         check_table_path(tmp_path / "fleet.csv", tmp_path / "fleet.csv.work")
     with pytest.raises(UsageError, match="ends neither"):
         check_table_path(tmp_path / "fleet.xlsx", tmp_path)
-    with pytest.raises(UsageError, match="no such table"):
+    with pytest.raises(UsageError, match=r"this table does not exist\. Make one: tdhil fleet LOG LOG --out fleet.csv"):
         read_table(tmp_path / "none.csv")
+    (tmp_path / "result.json").write_text("{}")
+    with pytest.raises(UsageError, match=r"is not a table \(.parquet, .csv or .sqlite\). Make one: tdhil fleet "):
+        read_table(tmp_path / "result.json")
     for ending in (".csv", ".sqlite"):
         (tmp_path / f"fleet{ending}").write_text("mine\n1\n")
         with pytest.raises(UsageError, match="is no table of a fleet"):

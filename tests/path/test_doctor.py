@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -114,7 +115,10 @@ def test_timer_and_scheduling():
 def test_disk(tmp_path, monkeypatch):
     from tdhil.cli import doctor
 
-    assert disk_finding(tmp_path / "run.mcap").grade == "ok"
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: SimpleNamespace(free=80_221_000_000))
+    free = disk_finding(tmp_path / "run.mcap")
+    assert (free.grade, free.said) == ("ok", f"80 GB free for {tmp_path / 'run.mcap'}")
+    monkeypatch.undo()
     assert "Make that folder" in disk_finding(tmp_path / "none" / "run.mcap").do
     monkeypatch.setattr(doctor, "WANTED_FREE_BYTES", math.inf)
     assert disk_finding(tmp_path / "run.mcap").grade == "bad"

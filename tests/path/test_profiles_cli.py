@@ -56,7 +56,18 @@ def test_a_page_fits_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     for name in ("abb/acs880-enhanced", "siemens/s120-canopen"):
         assert max(map(len, tdhil("profiles", "show", name).out.splitlines())) <= 80
-    assert max(map(len, tdhil("profiles").out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("columns", [80, 60, 40])
+def test_the_table_is_short_and_cuts_no_word(columns, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    lines = tdhil("profiles").out.splitlines()
+    assert max(map(len, lines)) <= max(columns, 56) and len(lines) <= len(profile_names()) + 8
+    assert {line.split(" ")[0] for line in lines} >= set(profile_names())
+    (fcan,) = (line.split() for line in lines if line.startswith("abb/acs880-fcan"))
+    assert fcan[:4] == ["abb/acs880-fcan", "canopen", "no", "0/6/3"]
+    assert (" ".join(fcan[4:]) == "heartbeat → coast") == (columns == 80)
+    assert "V/L/U: number of entries that are verified, likely, unverified." in " ".join(" ".join(lines).split())
 
 
 def test_an_unknown_name_lists_similar_names():

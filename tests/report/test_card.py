@@ -14,6 +14,7 @@ from tdhil.report.card import (
     card_text,
     estimate_text,
     inertia_text,
+    opinion_rows,
     print_card,
 )
 from tdhil.report.document import result_document
@@ -165,3 +166,9 @@ def test_a_rehearsal_is_marked_on_card_and_report():
     assert "SIMULATED · FAULT REHEARSAL" in card
     assert "torque-scale=1.1" in card
     assert "FAULT REHEARSAL" in report_of(document, recording()).simulated
+
+
+def test_a_cross_check_without_a_j_beside_it_says_so():
+    (row,) = opinion_rows({"second_opinions": [
+        {"route": "speed change", "agrees": None, "inertia_kg_m2": {"value": 104.0, "low": 100.0, "high": 108.0}}]})
+    assert "  not compared: the run gives no J, speed change" in row[1].plain

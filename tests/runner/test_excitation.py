@@ -130,6 +130,22 @@ def test_refuses_by_name(wish, word):
         make_plan(LIMITS, GUESS, wish)
 
 
+@pytest.mark.parametrize(("wish", "words", "advice"), [
+    (PlanRequest(amplitude_rad_s=15.0), "speed window (upper end): an amplitude of 15 rad/s (143 rpm) at",
+     "If you meant rpm, write --amplitude 15rpm. Otherwise change --amplitude, --offset, --frequency or the limits"),
+    (PlanRequest(amplitude_rad_s=15.00005), "of 15 rad/s (143 rpm)", "Change --amplitude"),    # 143.24rpm
+    (PlanRequest(amplitude_rad_s=400.0), "of 400 rad/s (3820 rpm)", "Change --amplitude"),
+    (PlanRequest(offsets_rad_s=(40.0,)), "leaves no room for any excitation at 40 rad/s (382 rpm)",
+     "If you meant rpm, write --offset 40rpm. "),
+    (PlanRequest(offsets_rad_s=(400.0,)), "at 400 rad/s (3820 rpm)", "Change --amplitude"),
+])
+def test_a_speed_outside_the_window_is_stated_in_both_units(wish, words, advice):
+    with pytest.raises(PlanRefused) as caught:
+        make_plan(LIMITS, GUESS, wish)
+    assert words in str(caught.value) and caught.value.next_step.startswith(advice)
+    assert str(caught.value).endswith(". A plan uses 0.785 to 9.71 rad/s (7.5 to 92.8 rpm)")
+
+
 @pytest.mark.parametrize(
     ("limits", "guess", "word"),
     [

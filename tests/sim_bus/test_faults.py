@@ -34,7 +34,9 @@ def test_the_parts_may_be_left_out():
 
 @pytest.mark.parametrize(("text", "said"), [
     ("", "is no fault"), ("STO", "is no fault"), ("sto@", "is no fault"), ("sto@hold+2", "no moment"),
-    ("sto@landing+2s", "no moment"), ("sto@-2s", "no moment"), ("nothing-such", "no fault is called"),
+    ("sto@landing+2s", "no moment"), ("sto@-2s", "no moment"),
+    ("nothing-such", "no fault is called 'nothing-such'. --fault list shows them"),
+    ("heartbeat-loss@hold", "no fault is called 'heartbeat-loss'. Did you mean 'heartbeat-lost'? --fault list shows"),
     ("sto=5", "takes no value"), ("frame-loss=200%", "0% to 100%"), ("frame-loss=x", "SHARE"),
     ("emcy=12345", "four hexadecimal"), ("sdo-abort=6072h:999", "an object"), ("torque-scale=0", "0.01 to 100"),
     ("torque-scale=1.1@setup", "Write torque-scale@setup=1.1"), ("torque-scale=much", "'much' is not a number"),
@@ -103,12 +105,13 @@ def test_the_list(kind, capsys):
     assert main([kind, "--fault", "list"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in KINDS)
-    assert len(out.splitlines()) == len(KINDS) + 3      # outside a terminal each fault has one line
+    assert len(out.splitlines()) == len(KINDS) + 4      # outside a terminal each fault has one line
 
 
 def test_the_list_is_wrapped_at_the_width_of_the_terminal():
     found = KINDS.listing(80)
     assert max(map(len, found.splitlines())) <= 80
+    assert found.count("row: number of the row in docs/reference/faults.md") == 1
     assert " ".join(found.split()) == " ".join(KINDS.listing(1000).split())
 
 

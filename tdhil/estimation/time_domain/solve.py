@@ -494,11 +494,11 @@ def _budget(
     whole = 0.5 * (inertia.high - inertia.low)
     lags = math.sqrt(max(one_pole**2 - noise**2, 0.0))
     structure = math.sqrt(max(whole**2 - one_pole**2, 0.0)) if math.isfinite(whole) else math.inf
-    known = "as stated" if stated else "nothing was stated of them"
+    known = "as stated" if stated else "none is stated"
     return (
-        BudgetLine("noise", noise, "load disturbance and noise of both signals, were the lags known"),
-        BudgetLine("lags", lags, f"of the reported speed and torque, and their time offset; {known}"),
+        BudgetLine("noise", noise, "disturbance of the load and noise of both signals, for known lags"),
+        BudgetLine("lags", lags, f"lags and time offset of the reported signals; {known}"),
         BudgetLine("lag structure", structure, "one pole, two, an average or a delay"),
-        BudgetLine("friction model", abs(shift), "friction with and without a part that grows with the speed's square"
+        BudgetLine("friction model", abs(shift), "friction with and without a term in speed²"
                    + ("; it has one" if bent else "")),
     )

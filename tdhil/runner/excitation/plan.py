@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from profiles.quantities import in_rad_s_and_rpm, rpm_advice
 from tdhil.config import DEFAULT_EXCITATION, identified_before_echo
 from tdhil.recording import Segment
 from tdhil.runner.excitation import signals
 from tdhil.runner.excitation.reference import (
+    USUAL_STEP,
     DriveMode,
     MotionLimits,
     PeriodicReference,
@@ -375,13 +377,18 @@ def _amplitude_and_offsets(fits: list[_FittedShape], wish: PlanRequest) -> tuple
         raise PlanRefused("at least one offset is needed")
     offsets = wish.offsets_rad_s or _default_offsets(fits[0].around(fits[1:]), wish)
     largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets for fit in fits)
+    low, high = fits[0].limits.usable_low_rad_s, fits[0].limits.usable_high_rad_s
+    window = f". A plan uses {in_rad_s_and_rpm(low, high)}" if limit.startswith("speed window") else ""
     if largest <= 0.0:
-        raise PlanRefused(f"{limit} leaves no room for any excitation at {where:.3g} rad/s")
+        advice = rpm_advice(where, "--offset", low, high) if wish.offsets_rad_s else "Change"
+        raise PlanRefused(f"{limit} leaves no room for any excitation at {in_rad_s_and_rpm(where)}{window}",
+                          USUAL_STEP.replace("Change", advice))
     amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
     if amplitude > largest * (1.0 + 1e-9):
         raise PlanRefused(
-            f"{limit}: an amplitude of {amplitude:g} rad/s at {where:.3g} rad/s does not fit; "
-            f"{largest:.3g} rad/s would fit"
+            f"{limit}: an amplitude of {in_rad_s_and_rpm(amplitude)} at {in_rad_s_and_rpm(where)} does not fit; "
+            f"{in_rad_s_and_rpm(largest)} would fit{window}",
+            USUAL_STEP.replace("Change", rpm_advice(amplitude, "--amplitude", 0.0, largest)),
         )
     return amplitude, tuple(offsets)
 
