@@ -88,8 +88,11 @@ def check_signals(recording: Recording, samples: Samples) -> None:
                           entry=MessageCode.SIGNAL_CLIPPED)
 
 
-def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
-    """Raise Refused for an open inertia, with the motion of the recording and the motion that would determine J."""
+def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...], beyond: str) -> NoReturn:
+    """Raise Refused for an open inertia, with the motion of the recording and the motion that would determine J.
+
+    ``beyond``: the report whose lag is longer than the bound, "" for none.
+    """
     if not found:
         raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE,
                       entry=MessageCode.NO_EXCITATION)
@@ -112,8 +115,21 @@ def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
     if np.count_nonzero(np.diff(np.sign(fast))) < _TURNS:
         raise Refused("one change of speed does not separate inertia, friction and the lags of the reported "
                       "signals", ADVICE, entry=MessageCode.NO_EXCITATION)
+    refuse_long_lag(beyond)
     raise Refused("torque and speed do not separate the inertia from friction, noise and the lags of the "
                   "reported signals", ADVICE)
+
+
+def refuse_long_lag(report: str) -> None:
+    """Raise Refused if the lag of a report, "speed" or "torque", is longer than the bound; "" for none."""
+    if report:
+        other = "speed" if report == "torque" else "torque"
+        raise Refused(
+            f"the reported {report} lags the {other} by more than {LAG_BOUND_S:g} s, which is the longest lag that "
+            "tdhil considers unless a lag is stated",
+            f"state the filter of the reported {report} (--{report}-lag, --{report}-lag-sd), or record the {report} "
+            "without a filter",
+        )
 
 
 def _blocks(signal: FloatArray) -> FloatArray:
@@ -188,7 +204,8 @@ def identify_record(case: Case) -> Finding:
     found = _runs(few, case.recording)
     solved, conditions = _solved(case.recording, few, found, case.options)
     if solved is None or _is_open(solved.inertia):
-        refuse_open(few, found)
+        refuse_open(few, found, "" if solved is None else solved.beyond)
+    refuse_long_lag(solved.beyond)
     inside = sum(run.length_s for run in found) / float(few.time_s[-1] - few.time_s[0])
     used = min(case.samples_used, round(inside * case.samples_used))
     finding = finding_of(solved, case)

@@ -8,6 +8,7 @@ import numpy as np
 
 from tdhil.estimation.candidates import NARROW_BAND, SQUARE, STRAIGHT, WIDE_BAND, FitRoute, ModelTrial, walk
 from tdhil.estimation.frequency_domain import (
+    LAG_BOUND_S,
     Fit,
     GaussianPrior,
     fisher_tail,
@@ -255,12 +256,18 @@ def _shares(problem: FitProblem, theta: FloatArray, direction: FloatArray) -> fl
 # ---------------------------------------------------------------------------------------------------------------------
 
 _SURELY = 3.0       # times the reach², from which friction is nonlinear; between 1 and this both are possible
+_AT_BOUND = 1e-3    # share of the bound; a lag so near counts as at the bound
+_FARTHER = 4.0      # times the bound, up to which a longer lag is tried
+_CLEARLY_LONGER = 10.0   # of −2 ln L; least improvement by a longer lag, about three standard deviations
 _OF_REPORTS = (SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE)
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Solution of the bins. ``bent``: friction has a part ∝ speed²; ``shaped``: a filter differs from one pole."""
+    """Solution of the bins. ``bent``: friction has a part ∝ speed²; ``shaped``: a filter differs from one pole.
+
+    ``beyond``: the report, "speed" or "torque", whose lag is longer than the bound; "" for none.
+    """
 
     inertia: Estimate
     viscous: Estimate
@@ -273,6 +280,7 @@ class Solved:
     bent: bool
     shaped: bool
     bins: int
+    beyond: str = ""
 
 
 @dataclass(frozen=True)
@@ -424,7 +432,28 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
         bent=bent,
         shaped=chosen.shaped,
         bins=len(problem.bins),
+        beyond=_lag_beyond(chosen, stated),
     )
+
+
+def _lag_beyond(shaft: ShaftEquation, stated: tuple[int, ...]) -> str:
+    """Return the report whose lag is at its bound, if a longer lag explains the bins clearly better; "" for none.
+
+    J and the lags compensate each other, so a lag held at the bound makes J wrong. A true lag at the bound itself needs
+    no longer one. The model with the longer lag must pass its own test: other faults move a lag to its bound, too.
+    """
+    problem, fit = shaft.problem, shaft.fit
+    at = [index for index in (SPEED_LAG, TORQUE_LAG)
+          if index not in stated and fit.theta[index] >= (1.0 - _AT_BOUND) * LAG_BOUND_S]
+    if not at:
+        return ""
+    high = problem.box.high.copy()
+    high[at] = _FARTHER * LAG_BOUND_S
+    longer = minimise(replace(problem, box=replace(problem.box, high=high)), fit.theta)
+    tested = local_test(problem, longer.theta, shaft.spread.factor)
+    if fit.objective - longer.objective <= _CLEARLY_LONGER or tested is None or doubtful(tested):
+        return ""
+    return "torque" if longer.theta[TORQUE_LAG] > longer.theta[SPEED_LAG] else "speed"
 
 
 def _shaft(
