@@ -407,9 +407,38 @@ def at_the_limit(r):
     return replace(r, torque_limit_nm=200.0)
 
 
-HOPELESS = [(constant_speed, "constant"), (coasting, "Coasting"), (no_torque, "torque did not change"),
+def cut_off_before_its_noise(r):
+    return replace(r, torque_nm=np.minimum(r.torque_nm, 150.0) + noise(r, 2.0))
+
+
+def never_negative(r):
+    return replace(r, torque_nm=np.maximum(r.torque_nm, 0.0))
+
+
+def speed_cut_off(r):
+    return replace(r, speed_rad_s=np.minimum(r.speed_rad_s, 5.0) + noise(r, 0.003))
+
+
+def held(signal, r):
+    first, last = np.searchsorted(r.time_s, (30.0, 60.0))
+    return np.concatenate([signal[:first], np.full(last - first, signal[first]), signal[last:]])
+
+
+def torque_frozen(r):
+    return replace(r, torque_nm=held(r.torque_nm, r))
+
+
+def speed_frozen(r):
+    return replace(r, speed_rad_s=held(r.speed_rad_s, r))
+
+
+HOPELESS = [(turned_round, "inverted"), (cut_off_before_its_noise, "torque is cut off"),
+            (torque_frozen, "torque was frozen"),
+            (speed_frozen, "speed was frozen"), (never_negative, "torque is cut off"),
+            (speed_cut_off, "speed is cut off"),
+            (constant_speed, "constant"), (coasting, "Coasting"), (no_torque, "torque did not change"),
             (standing, "speed did not change"), (slow_ramp, "one change of speed"), (only_noise, ""), (unrelated, ""),
-            (turned_round, ""), (at_the_limit, "limit")]
+            (at_the_limit, "limit")]
 
 
 @pytest.mark.long(but_first=4)

@@ -26,6 +26,7 @@ from tdhil.estimation.frequency_domain import (
 from tdhil.estimation.result import DOUBT_P, Estimate, Options, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
+from tdhil.estimation.time_domain.signal_faults import refuse_faulty_signals
 from tdhil.estimation.time_domain.solve import Solved, solve
 from tdhil.estimation.time_domain.stick_slip import refuse_stick_slip
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, place_windows, runs, thinned
@@ -88,8 +89,11 @@ def check_signals(recording: Recording, samples: Samples) -> None:
                           entry=MessageCode.SIGNAL_CLIPPED)
 
 
-def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...], beyond: str) -> NoReturn:
-    """Raise Refused for an open inertia, with the motion of the recording and the motion that would determine J.
+def refuse_open(
+    samples: Samples, found: tuple[OneWayStretch, ...], beyond: str, recording: Recording
+) -> NoReturn:
+    """Raise Refused for an open inertia, with the motion of the recording, or the fault of a signal, and the motion
+    that would determine J.
 
     ``beyond``: the report whose lag is longer than the bound, "" for none.
     """
@@ -116,6 +120,7 @@ def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...], beyond: str)
         raise Refused("one change of speed does not separate inertia, friction and the lags of the reported "
                       "signals", ADVICE, entry=MessageCode.NO_EXCITATION)
     refuse_long_lag(beyond)
+    refuse_faulty_signals(samples, recording.speed_resolution_rad_s, recording.torque_resolution_nm)
     raise Refused("torque and speed do not separate the inertia from friction, noise and the lags of the "
                   "reported signals", ADVICE)
 
@@ -204,7 +209,7 @@ def identify_record(case: Case) -> Finding:
     found = _runs(few, case.recording)
     solved, conditions = _solved(case.recording, few, found, case.options)
     if solved is None or _is_open(solved.inertia):
-        refuse_open(few, found, "" if solved is None else solved.beyond)
+        refuse_open(few, found, "" if solved is None else solved.beyond, case.recording)
     refuse_long_lag(solved.beyond)
     inside = sum(run.length_s for run in found) / float(few.time_s[-1] - few.time_s[0])
     used = min(case.samples_used, round(inside * case.samples_used))
