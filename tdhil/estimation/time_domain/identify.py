@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding, ModelWords
@@ -23,11 +22,11 @@ from tdhil.estimation.frequency_domain import (
     simultaneous,
     torque_scale_line,
 )
-from tdhil.estimation.result import DOUBT_P, Estimate, Options, Refused
+from tdhil.estimation.result import DOUBT_P, Estimate, Options, Refusal, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
 from tdhil.estimation.time_domain.signal_faults import refuse_faulty_signals
-from tdhil.estimation.time_domain.solve import Solved, solve
+from tdhil.estimation.time_domain.solve import ScaleChange, Solved, solve
 from tdhil.estimation.time_domain.stick_slip import refuse_stick_slip
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, place_windows, runs, thinned
 from tdhil.recording import FloatArray, Recording
@@ -36,7 +35,6 @@ from tdhil.recording import FloatArray, Recording
 # Kind of motion in a recording, in words, so that a refusal names the missing part.
 
 
-IntArray = NDArray[np.intp]
 _STEADY_SHARE = 0.05       # of the speed: with less excursion the speed is constant
 _IDLE_SHARE = 0.02         # of the torque's span: a smaller torque counts as none
 _FLAT_SHARE = 0.01        # largest share of samples on a plateau
@@ -58,18 +56,8 @@ def check_signals(recording: Recording, samples: Samples) -> None:
     if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s or np.ptp(speed) == 0.0:
         raise Refused("the speed did not change", ADVICE, entry=MessageCode.NO_EXCITATION)
     if np.ptp(torque) <= 2.0 * recording.torque_resolution_nm or np.ptp(torque) == 0.0:
-        raise Refused("the torque did not change. Coasting gives only the ratio of inertia and friction", "move "
-                                                                                                          "the "
-                                                                                                          "shaft "
-                                                                                                          "by "
-                                                                                                          "the "
-                                                                                                          "drive's "
-                                                                                                          "torque, "
-                                                                                                          "and "
-                                                                                                          "record "
-                                                                                                          "this "
-                                                                                                          "torque",
-                       entry=MessageCode.NO_EXCITATION)
+        raise Refused("the torque did not change. Coasting gives only the ratio of inertia and friction",
+                      "move the shaft by the drive's torque, and record this torque", entry=MessageCode.NO_EXCITATION)
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
     if flagged > LIMIT_SHARE:
@@ -277,6 +265,8 @@ def finding_of(solved: Solved, case: Case) -> Finding:
     bare = Finding(model=MODEL, words=words, residual=solved.residual, warnings=_caveats(solved), reject_p=DOUBT_P)
     if bare.rejected:
         return bare
+    if solved.scale is not None:
+        return bare.taken_back(_scale_changes(solved.scale))
     scale = torque_scale_line(solved.inertia.value, case.recording.torque_scale_rel_sd, case.options.confidence)
     return replace(
         bare,
@@ -289,6 +279,21 @@ def finding_of(solved: Solved, case: Case) -> Finding:
         skew_s=_unless_open(solved.skew_s, SKEW_BOUND_S),
         budget=(*solved.budget, scale),
     )
+
+
+def _scale_changes(change: ScaleChange) -> Refusal:
+    """Return the contradiction. The scale may be right at any speed, or at none, so that no interval surely covers."""
+    share = f"{100 * abs(change.share):.0f} %"
+    if change.braking:
+        return Refusal(
+            f"the torque has another scale in braking than in driving, by {share}",
+            "use a torque signal instead of a current, or a record that slows down by friction only",
+            entry=MessageCode.MODEL_REJECTED)
+    return Refusal(
+        f"J differs between low and high speed, by {share} from {change.low_rad_s:.3g} to {change.high_rad_s:.3g} "
+        "rad/s: the scale of the torque changes with speed",
+        "use a record below base speed, or a torque signal instead of a current",
+        entry=MessageCode.MODEL_REJECTED)
 
 
 def _unless_open(estimate: Estimate, bound: float) -> Estimate | None:

@@ -29,9 +29,11 @@ from tdhil.estimation.time_domain.equation import (
     TORQUE_SHAPE,
     VISCOUS,
     evaluate,
+    scale_slopes,
 )
 from tdhil.estimation.time_domain.fit import FitProblem, FoundFit, covariance, minimise, search
-from tdhil.estimation.time_domain.windows import Bins, TaperWindow
+from tdhil.estimation.time_domain.taylor import ComplexArray
+from tdhil.estimation.time_domain.windows import Bins, TaperWindow, joined, measure
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -111,13 +113,20 @@ class BlockVariance:
 
 def block_scores(problem: FitProblem, placed: tuple[TaperWindow, ...], theta: FloatArray) -> FloatArray:
     """Return g_b (blocks, 10), in order of time."""
+    whole = evaluate(theta, problem.bins)
+    return _in_blocks(problem, placed, whole.error, whole.slopes)
+
+
+def _in_blocks(
+    problem: FitProblem, placed: tuple[TaperWindow, ...], error: ComplexArray, slopes: ComplexArray
+) -> FloatArray:
+    """Return the parts (blocks, P) of the score of ``error`` (M,) with the ``slopes`` (M, P), in order of time."""
     total = sum(window.hop_s for window in placed)
     length = max(total / _BLOCKS, min(_BLOCK_S, total / _LEAST_BLOCKS))
     bins = problem.bins
-    whole = evaluate(theta, bins)
     # the mean of a product of two real signals is half that of their lines, except at frequency zero
     white = np.where(bins.hertz > 0.0, 2.0, 1.0) / np.sqrt(problem.variance)
-    both = np.column_stack([whole.error, whole.slopes]) * white[:, None]
+    both = np.column_stack([error, slopes]) * white[:, None]
     scores = []
     for window in placed:
         mine = bins.window == float(window.number)
@@ -128,8 +137,8 @@ def block_scores(problem: FitProblem, placed: tuple[TaperWindow, ...], theta: Fl
         points = blocks * math.ceil((2.0 * float(turns.max()) + 1.0) / blocks)
         signals = (np.exp(2j * math.pi / points * np.outer(np.arange(points), turns)) @ both[mine]).real
         each = signals[:, 1:] * signals[:, :1] / points
-        scores.append(each.reshape(blocks, -1, len(theta)).sum(axis=1))
-    return np.concatenate(scores) if scores else np.zeros((0, len(theta)))
+        scores.append(each.reshape(blocks, -1, slopes.shape[1]).sum(axis=1))
+    return np.concatenate(scores) if scores else np.zeros((0, slopes.shape[1]))
 
 
 def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
@@ -142,6 +151,77 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
     count = square**2 / max(float(np.sum(each**4)), 1e-300)
     # the fit removes about one part in the effective number of blocks from each block
     return BlockVariance(max(square + neighbours, 0.5 * square) * count / max(count - 1.0, 1.0), count)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A torque scale that changes with the motion. The local test fits any smooth response over frequency, and is blind to
+# it.
+#
+# If the scale changes with speed, as that of a current above base speed, J becomes J + J₁|ω|. If braking torque has
+# another scale, as a current without the losses, a torque r T is added wherever T brakes. With the derivative of the
+# residuals by such a parameter, less the part that all other parameters and friction ∝ speed² explain, one step of
+# least squares gives the parameter. Its variance is the larger one of the noise model and of the sandwich, both with
+# the residuals that the parameter leaves: otherwise the change would count as noise. Friction f(ω) hardly looks like
+# J₁: over a record, ∫ f(ω) ω dω/dt dt depends on the first and the last speed only (docs/decisions/0091).
+
+
+_CLEAR_CHANGE = 4.5       # sd; least clear change: few blocks of time make the tails of its distribution long
+_LEAST_BY_SPEED = 0.03    # of J, from low to high speed; a smaller change does no harm beside the torque scale
+_LEAST_BY_BRAKING = 0.08  # of the torque; noise of the torque itself looks like a few percent
+_LOW_TO_HIGH = (0.05, 0.95)   # quantiles of the speed
+
+
+@dataclass(frozen=True)
+class ScaleChange:
+    """Change of the torque's scale: as a ``share`` of J from the speed ``low_rad_s`` to ``high_rad_s``, or, if
+    ``braking``, of braking torque against driving torque. ``clear``: the change in its own standard deviations.
+    """
+
+    braking: bool
+    share: float
+    low_rad_s: float
+    high_rad_s: float
+    clear: float
+
+    @property
+    def found(self) -> bool:
+        least = _LEAST_BY_BRAKING if self.braking else _LEAST_BY_SPEED
+        return abs(self.clear) > _CLEAR_CHANGE and abs(self.share) > least
+
+
+def scale_changes(
+    problem: FitProblem, placed: tuple[TaperWindow, ...], theta: FloatArray, braking: ComplexArray
+) -> tuple[ScaleChange, ScaleChange]:
+    """Return the change with the speed, and that between driving and braking; ``braking`` as in `scale_slopes`."""
+    free = list(dict.fromkeys((*problem.free, BEND)))
+    bins, nuisance = problem.bins, problem.box.scale[free]
+    at, raw = evaluate(theta, bins), scale_slopes(theta, bins, braking)
+    left, slopes = problem.stacked(theta)
+    weight = (np.where(bins.hertz > 0.0, np.sqrt(2.0), 1.0) / np.sqrt(problem.variance))[:, None]
+    columns = np.zeros((len(left), 3))
+    columns[:, 0] = left
+    columns[: 2 * len(bins), 1:] = np.concatenate([(raw * weight).real, (raw * weight).imag])
+    by_others = np.linalg.lstsq(slopes[:, free] * nuisance, columns, rcond=None)[0]
+    columns -= slopes[:, free] * nuisance @ by_others
+    own: ComplexArray = np.column_stack([at.error, raw]) - at.slopes[:, free] * nuisance @ by_others
+    speeds = np.abs(np.concatenate([window.part(0.0, window.length_s).speed_rad_s for window in placed]))
+    low, high = (float(speed) for speed in np.quantile(speeds, _LOW_TO_HIGH))
+    found = []
+    for number, unit in ((1, (high - low) / max(abs(float(theta[INERTIA])), 1e-300)), (2, 1.0)):
+        information = max(float(columns[:, number] @ columns[:, number]), 1e-300)
+        change = -float(columns[:, number] @ columns[:, 0]) / information
+        scores = _in_blocks(problem, placed, own[:, 0] + change * own[:, number], own[:, number : number + 1])
+        left_over = 1.0 - change**2 * information / max(float(columns[:, 0] @ columns[:, 0]), 1e-300)
+        variance = max(sandwich(scores, np.array([1.0 / information])).variance, left_over / information)
+        found.append(ScaleChange(number == 2, change * unit, low, high, change / math.sqrt(variance)))
+    return found[0], found[1]
+
+
+def _braking(window: TaperWindow) -> TaperWindow:
+    """Return the window with the torque only where it opposes the rotation."""
+    samples, way = window.run.samples, window.run.direction
+    opposed = replace(samples, torque_nm=way * np.minimum(way * samples.torque_nm, 0.0))
+    return replace(window, run=replace(window.run, samples=opposed))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -266,7 +346,8 @@ _OF_REPORTS = (SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE)
 class Solved:
     """Solution of the bins. ``bent``: friction has a part ∝ speed²; ``shaped``: a filter differs from one pole.
 
-    ``beyond``: the report, "speed" or "torque", whose lag is longer than the bound; "" for none.
+    ``beyond``: the report, "speed" or "torque", whose lag is longer than the bound; "" for none. ``scale``: the
+    clearest change of the torque's scale; None without.
     """
 
     inertia: Estimate
@@ -281,6 +362,7 @@ class Solved:
     shaped: bool
     bins: int
     beyond: str = ""
+    scale: ScaleChange | None = None
 
 
 @dataclass(frozen=True)
@@ -306,11 +388,12 @@ class ShaftEquation:
 class _BandWalk:
     """State of the walk over the bands. ``bands``: the wide one, if it exists, and the narrow one.
 
-    ``stated``: indices of the lags that were stated.
+    ``stated``: indices of the lags that were stated. ``braking`` (M, 4): X_n of the braking torque, of all bins.
     """
 
     bands: tuple[FoundFit, ...]
     placed: tuple[TaperWindow, ...]
+    braking: ComplexArray
     stated: tuple[int, ...]
     confidence: float
     solved: Solved | None = None
@@ -324,7 +407,8 @@ def solve(
     """Walk the rows of a recording (`tdhil.estimation.candidates`). None if too few bins are clear of the noise."""
     bands = search(bins, priors, torque_span_nm)
     stated = tuple(prior.index for prior in priors)
-    return walk(FitRoute.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, stated, confidence)).solved
+    braking = joined([measure(_braking(window)) for window in placed] if bands else []).torque
+    return walk(FitRoute.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, braking, stated, confidence)).solved
 
 
 def _holds(solved: Solved | None) -> bool:
@@ -416,6 +500,8 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
     residual = local_test(problem, chosen.fit.theta, chosen.spread.factor)
     shift = float(square[1].theta[INERTIA]) - float(found.fit.theta[INERTIA])
     budget = _budget(chosen, value, shift, bent, stated)
+    changes = [change for change in scale_changes(problem, now.placed, chosen.fit.theta, now.braking[found.keep])
+               if change.found]
 
     def estimate(index: int) -> Estimate:
         return _estimate(chosen, index, confidence)
@@ -433,6 +519,7 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
         shaped=chosen.shaped,
         bins=len(problem.bins),
         beyond=_lag_beyond(chosen, stated),
+        scale=max(changes, key=lambda change: abs(change.clear), default=None),
     )
 
 
