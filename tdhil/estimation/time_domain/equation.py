@@ -69,3 +69,17 @@ def evaluate(theta: FloatArray, bins: Bins) -> Evaluated:
     slopes[:, BEND] = -bent
     slopes /= first[:, None]
     return Evaluated(error, slopes, c[:, 0] / first)
+
+
+def scale_slopes(theta: FloatArray, bins: Bins, braking: ComplexArray) -> ComplexArray:
+    """Return the derivatives (M, 2) of the residuals by J₁, if the inertia were J + J₁|ω|, and by r, if the reported
+    torque were 1 + r times the torque wherever it brakes.
+
+    The torque of J₁ is ½ J₁ d(ω|ω|)/dt; the square of the speed passes the filter as in `evaluate`. ``braking`` (M, 4):
+    X_n of the reported torque where it opposes the rotation, and zero elsewhere.
+    """
+    s, (lag_w, lag_t, skew, shape_w, shape_t) = bins.s, (float(value) for value in theta[SPEED_LAG:FORWARD])
+    by_speed = product(polynomial(s, 0.0, 0.5), polynomial(s, 1.0, lag_w, shape_w * lag_w**2))
+    a = product(exponential(s, skew), polynomial(s, 1.0, lag_t, shape_t * lag_t**2))
+    both = np.stack([np.einsum("mn,mn->m", by_speed, bins.bend), np.einsum("mn,mn->m", a, braking)], axis=1)
+    return np.asarray(-both / a[:, :1], dtype=np.complex128)

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from profiles import CodedText, MessageCode
 from tdhil.estimation.case import Case, Finding, ModelWords
@@ -23,10 +22,11 @@ from tdhil.estimation.frequency_domain import (
     simultaneous,
     torque_scale_line,
 )
-from tdhil.estimation.result import DOUBT_P, Estimate, Options, Refused
+from tdhil.estimation.result import DOUBT_P, Estimate, Options, Refusal, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
-from tdhil.estimation.time_domain.solve import Solved, solve
+from tdhil.estimation.time_domain.signal_faults import refuse_faulty_signals
+from tdhil.estimation.time_domain.solve import ScaleChange, Solved, solve
 from tdhil.estimation.time_domain.stick_slip import refuse_stick_slip
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, place_windows, runs, thinned
 from tdhil.recording import FloatArray, Recording
@@ -35,7 +35,6 @@ from tdhil.recording import FloatArray, Recording
 # Kind of motion in a recording, in words, so that a refusal names the missing part.
 
 
-IntArray = NDArray[np.intp]
 _STEADY_SHARE = 0.05       # of the speed: with less excursion the speed is constant
 _IDLE_SHARE = 0.02         # of the torque's span: a smaller torque counts as none
 _FLAT_SHARE = 0.01        # largest share of samples on a plateau
@@ -57,18 +56,8 @@ def check_signals(recording: Recording, samples: Samples) -> None:
     if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s or np.ptp(speed) == 0.0:
         raise Refused("the speed did not change", ADVICE, entry=MessageCode.NO_EXCITATION)
     if np.ptp(torque) <= 2.0 * recording.torque_resolution_nm or np.ptp(torque) == 0.0:
-        raise Refused("the torque did not change. Coasting gives only the ratio of inertia and friction", "move "
-                                                                                                          "the "
-                                                                                                          "shaft "
-                                                                                                          "by "
-                                                                                                          "the "
-                                                                                                          "drive's "
-                                                                                                          "torque, "
-                                                                                                          "and "
-                                                                                                          "record "
-                                                                                                          "this "
-                                                                                                          "torque",
-                       entry=MessageCode.NO_EXCITATION)
+        raise Refused("the torque did not change. Coasting gives only the ratio of inertia and friction",
+                      "move the shaft by the drive's torque, and record this torque", entry=MessageCode.NO_EXCITATION)
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
     if flagged > LIMIT_SHARE:
@@ -88,8 +77,14 @@ def check_signals(recording: Recording, samples: Samples) -> None:
                           entry=MessageCode.SIGNAL_CLIPPED)
 
 
-def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
-    """Raise Refused for an open inertia, with the motion of the recording and the motion that would determine J."""
+def refuse_open(
+    samples: Samples, found: tuple[OneWayStretch, ...], beyond: str, recording: Recording
+) -> NoReturn:
+    """Raise Refused for an open inertia, with the motion of the recording, or the fault of a signal, and the motion
+    that would determine J.
+
+    ``beyond``: the report whose lag is longer than the bound, "" for none.
+    """
     if not found:
         raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE,
                       entry=MessageCode.NO_EXCITATION)
@@ -112,8 +107,22 @@ def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
     if np.count_nonzero(np.diff(np.sign(fast))) < _TURNS:
         raise Refused("one change of speed does not separate inertia, friction and the lags of the reported "
                       "signals", ADVICE, entry=MessageCode.NO_EXCITATION)
+    refuse_long_lag(beyond)
+    refuse_faulty_signals(samples, recording.speed_resolution_rad_s, recording.torque_resolution_nm)
     raise Refused("torque and speed do not separate the inertia from friction, noise and the lags of the "
                   "reported signals", ADVICE)
+
+
+def refuse_long_lag(report: str) -> None:
+    """Raise Refused if the lag of a report, "speed" or "torque", is longer than the bound; "" for none."""
+    if report:
+        other = "speed" if report == "torque" else "torque"
+        raise Refused(
+            f"the reported {report} lags the {other} by more than {LAG_BOUND_S:g} s, which is the longest lag that "
+            "tdhil considers unless a lag is stated",
+            f"state the filter of the reported {report} (--{report}-lag, --{report}-lag-sd), or record the {report} "
+            "without a filter",
+        )
 
 
 def _blocks(signal: FloatArray) -> FloatArray:
@@ -188,7 +197,8 @@ def identify_record(case: Case) -> Finding:
     found = _runs(few, case.recording)
     solved, conditions = _solved(case.recording, few, found, case.options)
     if solved is None or _is_open(solved.inertia):
-        refuse_open(few, found)
+        refuse_open(few, found, "" if solved is None else solved.beyond, case.recording)
+    refuse_long_lag(solved.beyond)
     inside = sum(run.length_s for run in found) / float(few.time_s[-1] - few.time_s[0])
     used = min(case.samples_used, round(inside * case.samples_used))
     finding = finding_of(solved, case)
@@ -255,6 +265,8 @@ def finding_of(solved: Solved, case: Case) -> Finding:
     bare = Finding(model=MODEL, words=words, residual=solved.residual, warnings=_caveats(solved), reject_p=DOUBT_P)
     if bare.rejected:
         return bare
+    if solved.scale is not None:
+        return bare.taken_back(_scale_changes(solved.scale))
     scale = torque_scale_line(solved.inertia.value, case.recording.torque_scale_rel_sd, case.options.confidence)
     return replace(
         bare,
@@ -267,6 +279,21 @@ def finding_of(solved: Solved, case: Case) -> Finding:
         skew_s=_unless_open(solved.skew_s, SKEW_BOUND_S),
         budget=(*solved.budget, scale),
     )
+
+
+def _scale_changes(change: ScaleChange) -> Refusal:
+    """Return the contradiction. The scale may be right at any speed, or at none, so that no interval surely covers."""
+    share = f"{100 * abs(change.share):.0f} %"
+    if change.braking:
+        return Refusal(
+            f"the torque has another scale in braking than in driving, by {share}",
+            "use a torque signal instead of a current, or a record that slows down by friction only",
+            entry=MessageCode.MODEL_REJECTED)
+    return Refusal(
+        f"J differs between low and high speed, by {share} from {change.low_rad_s:.3g} to {change.high_rad_s:.3g} "
+        "rad/s: the scale of the torque changes with speed",
+        "use a record below base speed, or a torque signal instead of a current",
+        entry=MessageCode.MODEL_REJECTED)
 
 
 def _unless_open(estimate: Estimate, bound: float) -> Estimate | None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from tdhil.estimation.candidates import NARROW_BAND, SQUARE, STRAIGHT, WIDE_BAND, FitRoute, ModelTrial, walk
 from tdhil.estimation.frequency_domain import (
+    LAG_BOUND_S,
     Fit,
     GaussianPrior,
     fisher_tail,
@@ -28,9 +29,11 @@ from tdhil.estimation.time_domain.equation import (
     TORQUE_SHAPE,
     VISCOUS,
     evaluate,
+    scale_slopes,
 )
 from tdhil.estimation.time_domain.fit import FitProblem, FoundFit, covariance, minimise, search
-from tdhil.estimation.time_domain.windows import Bins, TaperWindow
+from tdhil.estimation.time_domain.taylor import ComplexArray
+from tdhil.estimation.time_domain.windows import Bins, TaperWindow, joined, measure
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -110,13 +113,20 @@ class BlockVariance:
 
 def block_scores(problem: FitProblem, placed: tuple[TaperWindow, ...], theta: FloatArray) -> FloatArray:
     """Return g_b (blocks, 10), in order of time."""
+    whole = evaluate(theta, problem.bins)
+    return _in_blocks(problem, placed, whole.error, whole.slopes)
+
+
+def _in_blocks(
+    problem: FitProblem, placed: tuple[TaperWindow, ...], error: ComplexArray, slopes: ComplexArray
+) -> FloatArray:
+    """Return the parts (blocks, P) of the score of ``error`` (M,) with the ``slopes`` (M, P), in order of time."""
     total = sum(window.hop_s for window in placed)
     length = max(total / _BLOCKS, min(_BLOCK_S, total / _LEAST_BLOCKS))
     bins = problem.bins
-    whole = evaluate(theta, bins)
     # the mean of a product of two real signals is half that of their lines, except at frequency zero
     white = np.where(bins.hertz > 0.0, 2.0, 1.0) / np.sqrt(problem.variance)
-    both = np.column_stack([whole.error, whole.slopes]) * white[:, None]
+    both = np.column_stack([error, slopes]) * white[:, None]
     scores = []
     for window in placed:
         mine = bins.window == float(window.number)
@@ -127,8 +137,8 @@ def block_scores(problem: FitProblem, placed: tuple[TaperWindow, ...], theta: Fl
         points = blocks * math.ceil((2.0 * float(turns.max()) + 1.0) / blocks)
         signals = (np.exp(2j * math.pi / points * np.outer(np.arange(points), turns)) @ both[mine]).real
         each = signals[:, 1:] * signals[:, :1] / points
-        scores.append(each.reshape(blocks, -1, len(theta)).sum(axis=1))
-    return np.concatenate(scores) if scores else np.zeros((0, len(theta)))
+        scores.append(each.reshape(blocks, -1, slopes.shape[1]).sum(axis=1))
+    return np.concatenate(scores) if scores else np.zeros((0, slopes.shape[1]))
 
 
 def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
@@ -141,6 +151,77 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
     count = square**2 / max(float(np.sum(each**4)), 1e-300)
     # the fit removes about one part in the effective number of blocks from each block
     return BlockVariance(max(square + neighbours, 0.5 * square) * count / max(count - 1.0, 1.0), count)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A torque scale that changes with the motion. The local test fits any smooth response over frequency, and is blind to
+# it.
+#
+# If the scale changes with speed, as that of a current above base speed, J becomes J + J₁|ω|. If braking torque has
+# another scale, as a current without the losses, a torque r T is added wherever T brakes. With the derivative of the
+# residuals by such a parameter, less the part that all other parameters and friction ∝ speed² explain, one step of
+# least squares gives the parameter. Its variance is the larger one of the noise model and of the sandwich, both with
+# the residuals that the parameter leaves: otherwise the change would count as noise. Friction f(ω) hardly looks like
+# J₁: over a record, ∫ f(ω) ω dω/dt dt depends on the first and the last speed only (docs/decisions/0091).
+
+
+_CLEAR_CHANGE = 4.5       # sd; least clear change: few blocks of time make the tails of its distribution long
+_LEAST_BY_SPEED = 0.03    # of J, from low to high speed; a smaller change does no harm beside the torque scale
+_LEAST_BY_BRAKING = 0.08  # of the torque; noise of the torque itself looks like a few percent
+_LOW_TO_HIGH = (0.05, 0.95)   # quantiles of the speed
+
+
+@dataclass(frozen=True)
+class ScaleChange:
+    """Change of the torque's scale: as a ``share`` of J from the speed ``low_rad_s`` to ``high_rad_s``, or, if
+    ``braking``, of braking torque against driving torque. ``clear``: the change in its own standard deviations.
+    """
+
+    braking: bool
+    share: float
+    low_rad_s: float
+    high_rad_s: float
+    clear: float
+
+    @property
+    def found(self) -> bool:
+        least = _LEAST_BY_BRAKING if self.braking else _LEAST_BY_SPEED
+        return abs(self.clear) > _CLEAR_CHANGE and abs(self.share) > least
+
+
+def scale_changes(
+    problem: FitProblem, placed: tuple[TaperWindow, ...], theta: FloatArray, braking: ComplexArray
+) -> tuple[ScaleChange, ScaleChange]:
+    """Return the change with the speed, and that between driving and braking; ``braking`` as in `scale_slopes`."""
+    free = list(dict.fromkeys((*problem.free, BEND)))
+    bins, nuisance = problem.bins, problem.box.scale[free]
+    at, raw = evaluate(theta, bins), scale_slopes(theta, bins, braking)
+    left, slopes = problem.stacked(theta)
+    weight = (np.where(bins.hertz > 0.0, np.sqrt(2.0), 1.0) / np.sqrt(problem.variance))[:, None]
+    columns = np.zeros((len(left), 3))
+    columns[:, 0] = left
+    columns[: 2 * len(bins), 1:] = np.concatenate([(raw * weight).real, (raw * weight).imag])
+    by_others = np.linalg.lstsq(slopes[:, free] * nuisance, columns, rcond=None)[0]
+    columns -= slopes[:, free] * nuisance @ by_others
+    own: ComplexArray = np.column_stack([at.error, raw]) - at.slopes[:, free] * nuisance @ by_others
+    speeds = np.abs(np.concatenate([window.part(0.0, window.length_s).speed_rad_s for window in placed]))
+    low, high = (float(speed) for speed in np.quantile(speeds, _LOW_TO_HIGH))
+    found = []
+    for number, unit in ((1, (high - low) / max(abs(float(theta[INERTIA])), 1e-300)), (2, 1.0)):
+        information = max(float(columns[:, number] @ columns[:, number]), 1e-300)
+        change = -float(columns[:, number] @ columns[:, 0]) / information
+        scores = _in_blocks(problem, placed, own[:, 0] + change * own[:, number], own[:, number : number + 1])
+        left_over = 1.0 - change**2 * information / max(float(columns[:, 0] @ columns[:, 0]), 1e-300)
+        variance = max(sandwich(scores, np.array([1.0 / information])).variance, left_over / information)
+        found.append(ScaleChange(number == 2, change * unit, low, high, change / math.sqrt(variance)))
+    return found[0], found[1]
+
+
+def _braking(window: TaperWindow) -> TaperWindow:
+    """Return the window with the torque only where it opposes the rotation."""
+    samples, way = window.run.samples, window.run.direction
+    opposed = replace(samples, torque_nm=way * np.minimum(way * samples.torque_nm, 0.0))
+    return replace(window, run=replace(window.run, samples=opposed))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -255,12 +336,19 @@ def _shares(problem: FitProblem, theta: FloatArray, direction: FloatArray) -> fl
 # ---------------------------------------------------------------------------------------------------------------------
 
 _SURELY = 3.0       # times the reach², from which friction is nonlinear; between 1 and this both are possible
+_AT_BOUND = 1e-3    # share of the bound; a lag so near counts as at the bound
+_FARTHER = 4.0      # times the bound, up to which a longer lag is tried
+_CLEARLY_LONGER = 10.0   # of −2 ln L; least improvement by a longer lag, about three standard deviations
 _OF_REPORTS = (SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE)
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Solution of the bins. ``bent``: friction has a part ∝ speed²; ``shaped``: a filter differs from one pole."""
+    """Solution of the bins. ``bent``: friction has a part ∝ speed²; ``shaped``: a filter differs from one pole.
+
+    ``beyond``: the report, "speed" or "torque", whose lag is longer than the bound; "" for none. ``scale``: the
+    clearest change of the torque's scale; None without.
+    """
 
     inertia: Estimate
     viscous: Estimate
@@ -273,6 +361,8 @@ class Solved:
     bent: bool
     shaped: bool
     bins: int
+    beyond: str = ""
+    scale: ScaleChange | None = None
 
 
 @dataclass(frozen=True)
@@ -298,11 +388,12 @@ class ShaftEquation:
 class _BandWalk:
     """State of the walk over the bands. ``bands``: the wide one, if it exists, and the narrow one.
 
-    ``stated``: indices of the lags that were stated.
+    ``stated``: indices of the lags that were stated. ``braking`` (M, 4): X_n of the braking torque, of all bins.
     """
 
     bands: tuple[FoundFit, ...]
     placed: tuple[TaperWindow, ...]
+    braking: ComplexArray
     stated: tuple[int, ...]
     confidence: float
     solved: Solved | None = None
@@ -316,7 +407,8 @@ def solve(
     """Walk the rows of a recording (`tdhil.estimation.candidates`). None if too few bins are clear of the noise."""
     bands = search(bins, priors, torque_span_nm)
     stated = tuple(prior.index for prior in priors)
-    return walk(FitRoute.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, stated, confidence)).solved
+    braking = joined([measure(_braking(window)) for window in placed] if bands else []).torque
+    return walk(FitRoute.RECORD, _BAND_TRIALS, _BandWalk(bands, placed, braking, stated, confidence)).solved
 
 
 def _holds(solved: Solved | None) -> bool:
@@ -408,6 +500,8 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
     residual = local_test(problem, chosen.fit.theta, chosen.spread.factor)
     shift = float(square[1].theta[INERTIA]) - float(found.fit.theta[INERTIA])
     budget = _budget(chosen, value, shift, bent, stated)
+    changes = [change for change in scale_changes(problem, now.placed, chosen.fit.theta, now.braking[found.keep])
+               if change.found]
 
     def estimate(index: int) -> Estimate:
         return _estimate(chosen, index, confidence)
@@ -424,7 +518,29 @@ def _solve(now: _BandWalk, found: FoundFit, narrower: tuple[FoundFit, ...]) -> S
         bent=bent,
         shaped=chosen.shaped,
         bins=len(problem.bins),
+        beyond=_lag_beyond(chosen, stated),
+        scale=max(changes, key=lambda change: abs(change.clear), default=None),
     )
+
+
+def _lag_beyond(shaft: ShaftEquation, stated: tuple[int, ...]) -> str:
+    """Return the report whose lag is at its bound, if a longer lag explains the bins clearly better; "" for none.
+
+    J and the lags compensate each other, so a lag held at the bound makes J wrong. A true lag at the bound itself needs
+    no longer one. The model with the longer lag must pass its own test: other faults move a lag to its bound, too.
+    """
+    problem, fit = shaft.problem, shaft.fit
+    at = [index for index in (SPEED_LAG, TORQUE_LAG)
+          if index not in stated and fit.theta[index] >= (1.0 - _AT_BOUND) * LAG_BOUND_S]
+    if not at:
+        return ""
+    high = problem.box.high.copy()
+    high[at] = _FARTHER * LAG_BOUND_S
+    longer = minimise(replace(problem, box=replace(problem.box, high=high)), fit.theta)
+    tested = local_test(problem, longer.theta, shaft.spread.factor)
+    if fit.objective - longer.objective <= _CLEARLY_LONGER or tested is None or doubtful(tested):
+        return ""
+    return "torque" if longer.theta[TORQUE_LAG] > longer.theta[SPEED_LAG] else "speed"
 
 
 def _shaft(
