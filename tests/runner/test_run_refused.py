@@ -121,7 +121,7 @@ def test_an_inverted_sign_is_found_at_low_speed(world, mode):
     if mode == "torque":
         assert_at_rest(here, result)
         return
-    # The drive's speed control may accelerate such a shaft: its torque is removed while it is slow, and friction stops it.
+    # The drive's speed control may accelerate such a shaft. Its torque is removed while it is slow; friction stops it.
     assert result.stop.confirmed and "torque removed" in result.stop.trouble[0]
     assert here.drive.speed == 0.0 and here.drive.state is PowerState.OFF
     assert abs(here.drive.disabled_at[0]) < 0.02 * LIMITS.speed_max_rad_s
