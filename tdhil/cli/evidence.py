@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="evidence.zip",
                         help="default: beside the log; no file is overwritten")
     parser.add_argument(_OF_THE_CHECK, type=Path, metavar="evidence.zip", help="check this archive instead: digests, "
-                        "completeness, private texts, and J, identified again from its log")
+                        "completeness, private texts, and the result, identified again from its log")
     parser.add_argument("--sha256", metavar="HEX", help="with --check: the archive's SHA-256, as the publisher "
                         "states it")
     statement = parser.add_argument_group("statement of the publisher")

@@ -288,4 +288,5 @@ def _result_text(row: FleetRow) -> str:
     low, high = row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2
     inertia = inertia_text({"value": row.inertia_kg_m2, "low": low, "high": high})
     part = "" if row.part_text is None else f", {row.part_text}"
-    return f"{row.verdict}, J {inertia}{part}"
+    coverage = "" if row.confidence is None else f", {100.0 * row.confidence:g} % interval:"
+    return f"{row.verdict}, J{coverage} {inertia}{part}"

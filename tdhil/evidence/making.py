@@ -24,6 +24,7 @@ from tdhil.evidence.archive import (
     members_of,
     missing_in,
     problems_of_members,
+    text_of,
 )
 from tdhil.evidence.leaks import leaks_in, texts_in
 from tdhil.evidence.log_scrub import LogScrub
@@ -41,6 +42,21 @@ _REPLAYED: Final = 1e-6
 """Relative difference of a replay by the same version on another computer: rounding of the linear algebra."""
 OTHER_VERSION: Final = 0.01
 """Relative difference of a replay by another version, whose identification may be better."""
+_MOST: Final = 1e300
+"""Magnitude above which a stated value is no number: an integer of JSON may exceed every float."""
+_INTERVAL: Final = ("value", "low", "high", "low_total", "high_total")
+_MAY_LACK: Final = frozenset({
+    "backlash", "calibration_advised", "coulomb_nm.high_total", "coulomb_nm.low_total", "customer",
+    "frequency_response.lines.impedance_magnitude", "frequency_response.lines.impedance_phase_rad", "inertia_scope",
+    "order_number", "place", "speed_loop_present", "torque_scale_rel_sd", "viscous_nm_s_rad.high_total",
+    "viscous_nm_s_rad.low_total",
+})
+"""Keys that version 0.1.0 has since a later state. An archive of an earlier state lacks them."""
+_MAY_DIFFER: Final[Mapping[str, str]] = {
+    "second_opinions.note": "a sentence that has another wording in a later state of version 0.1.0",
+    "second_opinions.least_scale_change": "a later state of version 0.1.0 calculates it for two stages",
+}
+"""Keys whose values may differ in one version, each with its reason."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +121,7 @@ def make_evidence(
         stored: Mapping[str, Any] = run.result or {}
         before = stored if stored.get("tdhil") == __version__ else conclude(log)
         result = conclude(copy)
-        if _difference(before, result, _ALIKE):      # a number was a name
+        if _difference(_verdict_and_inertia(before), _verdict_and_inertia(result), _ALIKE):    # a number was a name
             raise LogError(
                 "scrubbing would change the result: a setting of the log has the name of the operator or rig",
                 where=str(log), next_step="Report it with the archive of tdhil support")
@@ -166,7 +182,9 @@ def check_evidence(archive: bytes, sha256: str = "", *, conclude: Conclude | Non
                              f" {100 * OTHER_VERSION:.0f} %")
             if conclude is None:
                 notes.append("the log was not identified again")
-            elif text := _difference(stated, conclude(copy), _REPLAYED if version == __version__ else OTHER_VERSION):
+            elif text := _difference(stated, json.loads(text_of(conclude(copy))),
+                                     _REPLAYED if version == __version__ else OTHER_VERSION,
+                                     one_version=version == __version__):
                 problems.append(f"the result does not follow from {LOG}: {text}")
         except TdhilError as error:
             problems.append(f"{LOG} can't be used: {error.what}")
@@ -217,18 +235,49 @@ def _members(log: Path, statement: PublisherStatement, result: Mapping[str, Any]
     return members_of(facts, log.read_bytes(), statement, result, version)
 
 
-def _difference(stated: Mapping[str, Any], found: Mapping[str, Any], share: float) -> str:
-    """Return how two results differ in verdict and J, in words; '' if they are equal within this share."""
-    if stated.get("verdict") != found.get("verdict"):
-        return f"the verdict is {found.get('verdict')}, not {stated.get('verdict')}"
-    ours, theirs = (one.get("inertia_kg_m2") for one in (stated, found))
-    if not isinstance(ours, Mapping) or not isinstance(theirs, Mapping):
-        return "" if ours == theirs else "only one of the two has an inertia"
-    for name in ("value", "low", "high", "low_total", "high_total"):
-        a, b = ours.get(name), theirs.get(name)
-        if not isinstance(a, int | float) or not isinstance(b, int | float) or not math.isclose(a, b, rel_tol=share):
-            return f"its {name} is {b}, not {a} kg·m²"
-    return ""
+def _verdict_and_inertia(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part of a result that scrubbing never changes."""
+    inertia = result.get("inertia_kg_m2")
+    return {"verdict": result.get("verdict"), "inertia_kg_m2": inertia if not isinstance(inertia, Mapping) else {
+        name: inertia.get(name) for name in _INTERVAL}}
+
+
+def _difference(stated: Any, found: Any, share: float, at: str = "", *, one_version: bool = True, size: float = 0.0
+                ) -> str:
+    """Return the first difference of two results, in words; '' if they are equal within this share.
+
+    ``at``: key of this part; ``size``: largest number of the interval to which a number belongs. Results of two
+    versions may have other keys and other texts. Their verdicts and numbers are compared.
+    """
+    if at in _MAY_DIFFER:
+        return ""
+    if isinstance(stated, Mapping) and isinstance(found, Mapping):
+        for name in (*found, *(name for name in stated if name not in found)):
+            place = f"{at}.{name}" if at else str(name)
+            if name in stated and name in found:
+                inner = max((abs(found[one]) for one in _INTERVAL if _is_number(found.get(one))), default=0.0)
+                if text := _difference(stated[name], found[name], share, place, one_version=one_version,
+                                       size=inner if name in _INTERVAL else 0.0):
+                    return text
+            elif one_version and not (name in found and place in _MAY_LACK):
+                return f"{place[:80]!r} is {'stated and not found' if name in stated else 'found and not stated'}"
+        return ""
+    if isinstance(stated, list) and isinstance(found, list) and len(stated) == len(found):
+        sizes = max((abs(one) for one in found if _is_number(one)), default=0.0)
+        parts = (_difference(one, other, share, at, one_version=one_version, size=sizes)
+                 for one, other in zip(stated, found, strict=True))
+        return next(filter(None, parts), "")
+    if _is_number(stated) and _is_number(found):
+        alike = math.isclose(stated, found, rel_tol=share, abs_tol=share * size)
+    elif isinstance(stated, str) and isinstance(found, str):
+        alike = stated == found or not (one_version or at.rpartition(".")[2] == "verdict")
+    else:
+        alike = type(stated) is type(found) and stated == found
+    return "" if alike else f"{at} is {repr(found)[:200]}, not {repr(stated)[:200]}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST
 
 
 def _problems_of_log(log: Path, *, rig_name: bool) -> Iterator[str]:

@@ -46,10 +46,11 @@ class FleetRow:
 
     For the inertia ``low`` to ``high`` is the repeatability on this drive; ``low_total`` to ``high_total`` include the
     torque scale with its standard uncertainty ``torque_scale_rel_sd`` (a share). ``torque_calibration`` is the date of
-    the calibration that it comes from. ``stored_…`` is the result that the run left in its log; ``changed``: this
-    result differs from it. The result of an aborted run uses the data before the abort: ``aborted_stage`` is the stage
-    that was aborted, ``aborted_by`` the kind of error that ended it. ``complete`` is False if the log ended before the
-    run. None: unknown, or absent. No field depends on the machine, the process or the time of the calculation.
+    the calibration that it comes from, ``torque_calibration_factor`` its factor. ``stored_…`` is the result that the
+    run left in its log; ``changed``: this result differs from it. The result of an aborted run uses the data before the
+    abort: ``aborted_stage`` is the stage that was aborted, ``aborted_by`` the kind of error that ended it. ``complete``
+    is False if the log ended before the run. None: unknown, or absent. No field depends on the machine, the process or
+    the time of the calculation.
     """
 
     log: str
@@ -67,7 +68,8 @@ class FleetRow:
     inertia_scope: str | None = _at("inertia_scope")     # bodies to which J refers, `tdhil.report.InertiaScope`
     confidence: float | None = _at("inertia_kg_m2.confidence")
     torque_scale_rel_sd: float | None = None
-    torque_calibration: str | None = None
+    torque_calibration: str | None = _at("torque_calibration.date")
+    torque_calibration_factor: float | None = _at("torque_calibration.factor")
     gear_ratio: float | None = _at("gear_ratio")
     viscous_nm_s_rad: float | None = _at("viscous_nm_s_rad.value")
     viscous_low_nm_s_rad: float | None = _at("viscous_nm_s_rad.low")
@@ -206,7 +208,7 @@ def row_of(
     }
     calibration = document.get("torque_calibration")
     if isinstance(calibration, Mapping):
-        facts |= {"torque_calibration": calibration.get("date"), "torque_scale_rel_sd": calibration.get("rel_sd")}
+        facts |= {"torque_scale_rel_sd": calibration.get("rel_sd")}
     if isinstance(used := document.get("torque_scale_rel_sd"), float):      # wider if the torque signals differ
         facts |= {"torque_scale_rel_sd": used}
     was = _stored(stored)

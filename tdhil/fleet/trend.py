@@ -71,10 +71,23 @@ def series_of(row: FleetRow) -> tuple[str | None, str | None]:
     return drive_of(row), row.profile
 
 
+def calibration_of(row: FleetRow) -> str:
+    """Return the date and the factor of the torque calibration; '' without one. The factor is what the runs share: two
+    calibrations from the same logs have one date. A row of an earlier version has no factor.
+    """
+    factor = row.torque_calibration_factor
+    return f"{row.torque_calibration or ''}{'' if factor is None else f' factor {factor!r}'}"
+
+
 def scale_of(row: FleetRow) -> str | None:
     """Return the torque scale: the drive, and its torque calibration. Between two scales it does not cancel."""
-    drive = drive_of(row)
-    return drive if drive is None or row.torque_calibration is None else f"{drive} calibrated {row.torque_calibration}"
+    drive, calibration = drive_of(row), calibration_of(row)
+    return f"{drive} calibrated {calibration}" if drive is not None and calibration else drive
+
+
+def _calibration_text(row: FleetRow) -> str | None:
+    day = (row.torque_calibration or "")[:10]
+    return f"{day} (factor {row.torque_calibration_factor:.6g})" if row.torque_calibration_factor else day or None
 
 
 def history_rows(rows: Sequence[FleetRow], *, rehearsals: bool = False) -> tuple[list[FleetRow], list[str]]:
@@ -136,10 +149,10 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None, *, rehearsa
         notes.append(f"the results have {len(scopes)} kinds of J ({', '.join(sorted(map(_scope_text, scopes)))}): the"
                      f" trend of the inertia is of the newest kind, {_scope_text(kept[-1][1].inertia_scope)}. Identify"
                      " all logs with the same --model to follow all of them")
-    calibrations = sorted({row.torque_calibration or "" for _, row in kept})
+    calibrations = {calibration_of(row): _calibration_text(row) or "none" for _, row in kept}
     if len(calibrations) > 1:
-        dates = ", ".join(one[:10] or "none" for one in calibrations)
-        notes.append(f"runs with different torque calibrations ({dates}): each has a torque scale of its own, which"
+        shown = ", ".join(calibrations[one] for one in sorted(calibrations))
+        notes.append(f"runs with different torque calibrations ({shown}): each has a torque scale of its own, which"
                      " stays in their differences")
     if any((one or "assumed").startswith("assumed") for one in drives):
         notes.append("the drive reports no serial number: runs on this rig are taken for runs on one drive")
@@ -287,7 +300,7 @@ def _settings(row: FleetRow, document: Mapping[str, Any], recording: Any, run: M
         "cycles, Hz": (document.get("cycle") or {}).get("rate_hz"),
         "gear": recording.gear_ratio,
         "standard uncertainty of the torque scale": row.torque_scale_rel_sd,
-        "torque calibration": None if row.torque_calibration is None else row.torque_calibration[:10],
+        "torque calibration": _calibration_text(row),
         "torque limit, N·m": recording.torque_limit_nm,
         "speed window, rad/s": f"{limits['speed_min_rad_s']:g} to {limits['speed_max_rad_s']:g}"
         if {"speed_min_rad_s", "speed_max_rad_s"} <= set(limits) else None,
@@ -356,7 +369,7 @@ def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
         change = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
         scale = "the same drive: its torque scale cancels" if change.shared_scale else (
             "two torque calibrations: the scale of each is in it"
-            if first.torque_calibration != other.torque_calibration
+            if calibration_of(first) != calibration_of(other)
             else "two drives: the torque scale of each is in it")
         if change.shared_scale and not (first.drive_serial and other.drive_serial):
             scale = "no serial numbers: taken for one drive, whose torque scale cancels"

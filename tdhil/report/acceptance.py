@@ -14,9 +14,10 @@ from math import sqrt
 from typing import Any, Final
 
 from profiles import MessageCode, with_code
+from profiles.quantities import plain_number
 from tdhil.config import ACCEPTED_QUANTITIES, Expectation
 from tdhil.report.inertia_scope import InertiaScope, scope_text
-from tdhil.report.intervals import coverage_of, with_interval
+from tdhil.report.intervals import coverage_of, rounded, with_interval
 
 Part = Mapping[str, Any]
 _WITH_TORQUE: Final = ("inertia", "viscous", "coulomb")
@@ -26,6 +27,8 @@ _SETTINGS: Final = ("torque-limit",)
 """Settings in the N·m of the drive, which the document has in calibrated N·m."""
 
 
+_MORE: Final = 4
+"""Most digits that a text of an acceptance may have beyond the usual ones."""
 LEAST_COVERAGE: Final = 0.95
 """Least coverage of an interval that decides on an acceptance."""
 
@@ -108,14 +111,14 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
     if value is None and quantity.reported:
         value, low, high = _identified(expected.name, _at(quantity.reported, document), document)
         how = "reported by the drive"
-    least, most = expected.value - expected.tolerance, expected.value + expected.tolerance
-    wanted = f"expected {expected.value:.5g} ± {expected.tolerance:.3g} {quantity.unit.symbol}"
+    more, unit = 0, quantity.unit.symbol
     if value is None or low is None or high is None:
         verdict, seen = AcceptanceVerdict.CANNOT_TELL, "not identified"
     else:
-        inside, apart = least <= low and high <= most, high < least or most < low
-        verdict = AcceptanceVerdict.PASS if inside else (
-            AcceptanceVerdict.FAIL if apart else AcceptanceVerdict.CANNOT_TELL)
+        verdict = _by_interval(expected.value, expected.tolerance, low, high)
+        # the least digits with which the printed numbers give this verdict
+        more = next((one for one in range(_MORE) if verdict is _by_interval(*(
+            float(text) for text in (*_shown(expected, one), *_ends(value, low, high, one))))), _MORE)
         other, scope = "", document.get("inertia_scope")          # none: a refusal
         if expected.name in _INERTIAS and scope is not None:
             # With a string the expected J is that of the motor's side, as for ``motor-inertia``. Else it is that of
@@ -129,9 +132,25 @@ def _judged(expected: Expectation, document: Part) -> Accepted:
         if low < high and coverage is not None and coverage < LEAST_COVERAGE:
             other += f", an interval with a coverage of {100.0 * coverage:g} %; acceptance needs 95 % or more"
         verdict = AcceptanceVerdict.CANNOT_TELL if other else verdict
-        seen = f"{how} {with_interval(value, low, high, quantity.unit.symbol)}{other}"
-    return Accepted(expected.name, quantity.label, quantity.unit.symbol, expected.value, expected.tolerance,
+        seen = f"{how} {with_interval(value, low, high, unit, more)}{other}"
+    wanted = "expected {} ± {} ".format(*_shown(expected, more)) + unit
+    return Accepted(expected.name, quantity.label, unit, expected.value, expected.tolerance,
                     value, low, high, verdict, f"{verdict}: {wanted}, {seen}")
+
+
+def _by_interval(expected: float, tolerance: float, low: float, high: float) -> AcceptanceVerdict:
+    least, most = expected - tolerance, expected + tolerance
+    if least <= low and high <= most:
+        return AcceptanceVerdict.PASS
+    return AcceptanceVerdict.FAIL if high < least or most < low else AcceptanceVerdict.CANNOT_TELL
+
+
+def _shown(expected: Expectation, more: int) -> tuple[str, str]:
+    return plain_number(expected.value, 5 + more), plain_number(expected.tolerance, 5 + more)
+
+
+def _ends(value: float, low: float, high: float, more: int) -> tuple[str, str]:
+    return rounded(value, low, high, more)[1:] if low < high else (plain_number(value, 5 + more),) * 2
 
 
 def _at(place: Iterable[str], document: Part) -> Any:

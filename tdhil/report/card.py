@@ -12,11 +12,11 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from profiles.quantities import plain_number
+from profiles.quantities import plain_number, printed_bound
 from tdhil.report.acceptance import acceptance_rows
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import coded_reason, coded_warnings, marks, rehearsal_rows, uploaded_rows
-from tdhil.report.intervals import interval_and_share, part_with_interval, percent, plus_minus_part, rounded, two_digits
+from tdhil.report.intervals import interval_and_share, part_with_interval, percent, plus_minus_part, rounded
 from tdhil.report.labels import (
     ACCELERATION_REGRESSION,
     BACKLASH,
@@ -141,7 +141,7 @@ def in_milliradians(part: Mapping[str, Any]) -> dict[str, float]:
     return {key: 1e3 * part[key] for key in ("value", "low", "high")}
 
 
-def in_degrees(part: Mapping[str, Any]) -> dict[str, float]:
+def in_degrees(part: Mapping[str, Any]) -> dict[str, Any]:
     """Return an angle with its interval, converted from rad to degrees."""
     return {key: math.degrees(part[key]) for key in ("value", "low", "high")}
 
@@ -162,12 +162,12 @@ def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool 
 
 
 def budget_figures(half_width: float | None, value: float | None) -> tuple[str, str]:
-    """Return a half-width of the budget, and its share of J in %. A contribution below `_NOTHING` is 0."""
+    """Return a half-width of the budget, and its share of J in %, rounded up. A contribution below `_NOTHING` is 0."""
     if half_width is None:
         return "open", ""
     if value is not None and half_width < _NOTHING * value:
         return "0", "0"
-    return two_digits(half_width), percent(half_width, value).strip("±% ") if value else ""
+    return printed_bound(half_width, 2, up=True), percent(half_width, value).strip("±% ") if value else ""
 
 
 def estimate_text(part: Mapping[str, Any], unit: str) -> str:

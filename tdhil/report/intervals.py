@@ -26,12 +26,12 @@ def coverage_of(document: Mapping[str, Any]) -> float | None:
     return None
 
 
-def with_interval(value: float, low: float, high: float, unit: str) -> str:
-    """Return ``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width set the decimals."""
+def with_interval(value: float, low: float, high: float, unit: str, more: int = 0) -> str:
+    """Return ``103.9 (103.1 to 104.8) kg·m²``: decimals for two significant digits of the half-width, and ``more``."""
     half = 0.5 * (high - low)
     if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
-        return f"{plain_number(value, 5)} {unit}"
-    return "{} ({} to {}) ".format(*rounded(value, low, high)) + unit
+        return f"{plain_number(value, 5 + more)} {unit}"
+    return "{} ({} to {}) ".format(*rounded(value, low, high, more)) + unit
 
 
 def part_with_interval(part: Mapping[str, Any], unit: str) -> str:
@@ -47,10 +47,10 @@ def table_cell(part: Mapping[str, Any], times: float = 1.0) -> str:
     return f"{value:.4g}" if low == high else "{} ({} to {})".format(*rounded(value, low, high))
 
 
-def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
+def rounded(value: float | None, low: float | None, high: float | None, more: int = 0) -> tuple[str, str, str]:
     """Return the three values as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
     ends = [number for number in (low, high) if number is not None]
-    half = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else 0.0
+    half = 0.5 * (ends[1] - ends[0]) / 10**more if len(ends) == 2 else 0.0
 
     if half > 0.0 and math.isfinite(half) and low is not None and high is not None:
         return "open" if value is None else _digits(value, half), *printed_ends(low, high, _decimals(half))
@@ -65,11 +65,6 @@ def plus_minus(value: float, half_width: float) -> str:
     middle = _digits(value, half_width)
     apart = half_width + abs(float(middle) - value)
     return f"{middle} ± {printed_ends(0.0, apart, _decimals(half_width))[1]}"
-
-
-def two_digits(half_width: float) -> str:
-    """Return a half-width with two significant digits and without an exponent: ``1200``, ``6.4``, ``0.000079``."""
-    return _digits(half_width, half_width) if 0.0 < half_width < math.inf else plain_number(half_width)
 
 
 def percent(half_width: float, value: float) -> str:

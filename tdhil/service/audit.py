@@ -41,6 +41,7 @@ from tdhil.service.store import read_json, write_json
 KEY_FILE: Final = "audit.key"
 LOCK_FILE: Final = "audit.lock"
 FIRST: Final = "0" * 64
+_FILES: Final = "????-??.jsonl"
 _HEAD: Final = re.compile(r"([0-9]{1,12}):([0-9a-f]{64})")
 
 
@@ -150,6 +151,21 @@ class Audit:
     def entries(self) -> Iterator[Entry]:
         """Yield all readable entries in order."""
         yield from _readable(self._lines())
+
+    def last_details(self, what: str, run: str) -> Mapping[str, Any] | None:
+        """Return the details of the last entry of this kind for a run whose own hash is right; None without one."""
+        marks, found = f'"what": {json.dumps(what)}, "run": {json.dumps(run)},'.encode(), None
+        with self._lock, self._alone():
+            seal = self._seal or self._read()
+            for path in sorted(self._folder.glob(_FILES)):
+                with path.open("rb") as file:
+                    # only the lines with these words are parsed: an audit has years of lines
+                    entries = [one for line in file if marks in line and isinstance(one := _entry(line), Entry)]
+                for one in entries:
+                    if (one.what, one.run) == (what, run) and seal is not None and hmac.compare_digest(
+                            seal.hash_of(one).encode(), one.hash.encode()):
+                        found = one.details
+        return found
 
     def verify(self, kept: ChainHead | None = None) -> Broken | None:
         """Return the first place where a line was changed, removed or inserted; None if the chain is intact.
@@ -282,7 +298,7 @@ class Audit:
         return found if good else None
 
     def _lines(self) -> Iterator[_Line]:
-        for path in sorted(self._folder.glob("????-??.jsonl")):
+        for path in sorted(self._folder.glob(_FILES)):
             with path.open("rb") as file:
                 for line, text in enumerate(file, start=1):
                     yield path.name, line, _entry(text)
@@ -298,6 +314,7 @@ def _entry(text: bytes) -> Entry | str:
         if text != json.dumps(plain, ensure_ascii=False).encode() + b"\n":
             return "it was changed after it was written"
         found = Entry(**plain)
-        return found if isinstance(found.number, int) and isinstance(found.hash, str) else "it can't be read"
+        right = isinstance(found.number, int) and isinstance(found.hash, str) and isinstance(found.details, Mapping)
+        return found if right else "it can't be read"
     except (ValueError, TypeError, RecursionError):
         return "it can't be read"

@@ -15,7 +15,15 @@ from typing import Any
 
 from tdhil.errors import LogError, MessageCode
 from tdhil.file_hash import sha256_of
-from tdhil.service.acceptance_signature import FILE, LONGEST_NAME, LONGEST_REMARK, PASS, AcceptanceSignature, hash_of
+from tdhil.service.acceptance_signature import (
+    FILE,
+    LONGEST_NAME,
+    LONGEST_REMARK,
+    PASS,
+    SIGNED,
+    AcceptanceSignature,
+    hash_of,
+)
 from tdhil.service.annotations import LONGEST_TEXT, one_line, tags_of
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import Conflict, State, now
@@ -149,7 +157,7 @@ class RunRecords:
                 wrong.append(("remark", f"a remark is needed, because the verdict is {verdict}"))
             require_right(wrong)
             signature = AcceptanceSignature(name, role, who, now(), remark, verdict, digest, hash_of(present))
-            self._audit(who, "acceptance signed", run, request.rig, **asdict(signature))
+            self._audit(who, SIGNED, run, request.rig, **asdict(signature))
             try:
                 write_json(self._store.place(run) / FILE, asdict(signature))
             except OSError as error:

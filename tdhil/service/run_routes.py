@@ -12,6 +12,7 @@ import anyio
 
 from tdhil.config import ASKED_AGAIN, STATED, resolve
 from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.service.acceptance_signature import SIGNED
 from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
 from tdhil.service.attendance import LEASE_S
@@ -221,7 +222,8 @@ async def sign_acceptance(site: Site, request: Request, body: SignatureBody) -> 
 def _acceptance_of(site: Site, run: str) -> AcceptanceView:
     found, log_sha256 = site.records.acceptance(run)
     signature = site.records.signature(run)
-    problem = "" if signature is None else signature.problem(found, log_sha256)
+    problem = "" if signature is None else signature.problem(
+        found, log_sha256, site.supervisor.audit.last_details(SIGNED, run))
     return AcceptanceView(run, found, log_sha256, signature, problem)
 
 

@@ -88,12 +88,14 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
 def _signed(document: dict[str, Any]) -> dict[str, Any]:
     """Return the result in the present folder with the signature under its acceptance, if a person signed it."""
     from tdhil.file_hash import sha256_of
-    from tdhil.service.acceptance_signature import FILE, AcceptanceSignature
+    from tdhil.service.acceptance_signature import FILE, SIGNED, AcceptanceSignature
+    from tdhil.service.audit import Audit
 
     acceptance, signature = document.get("acceptance"), read_as(AcceptanceSignature, Path(FILE))
     if not acceptance or signature is None:
         return document
-    problem = signature.problem(acceptance, sha256_of(Path(LOG), missing=""))
+    audited = Audit(Path("../../audit")).last_details(SIGNED, Path.cwd().name)
+    problem = signature.problem(acceptance, sha256_of(Path(LOG), missing=""), audited)
     return {**document, "acceptance": {**acceptance, "signature": {**asdict(signature), "problem": problem}}}
 
 

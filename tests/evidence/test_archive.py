@@ -108,8 +108,72 @@ def test_a_member_that_is_changed_with_its_digest_is_found(made, name, before, a
 def test_another_log_with_all_digests_right_is_found_by_the_replay(made):
     other = {**RESULT, "inertia_kg_m2": {**RESULT["inertia_kg_m2"], "value": 110.0}}
     assert problems(made.archive, conclude=lambda log: other) == (
-        "the result does not follow from run.mcap: its value is 110.0, not 104.0 kg·m²",)
+        "the result does not follow from run.mcap: inertia_kg_m2.value is 110.0, not 104.0",)
     assert "verdict" in problems(made.archive, conclude=lambda log: RESULT | {"verdict": "valid_wide"})[0]
+
+
+WHOLE = RESULT | {
+    "coulomb_nm": {"value": 61.2, "low": 57.9, "high": 64.5}, "speed_lag_s": {"value": 0.39, "low": 0.37, "high": 0.42},
+    "skew_s": {"value": 1e-9, "low": -0.002, "high": 0.002}, "torque_scale_rel_sd": 0.02, "samples_used": 3000,
+    "inertia_main_shaft_kg_m2": {"value": 416.0, "low": 412.0, "high": 420.0}, "residual": {"p_value": 0.36},
+    "acceptance": {"verdict": "fail", "checks": [{"name": "inertia", "passed": False}]}, "warnings": ["one", "two"],
+    "backlash": [], "second_opinions": [{"inertia_kg_m2": {"value": 102.0}, "note": "4 changes of speed"}],
+}
+
+
+def changed_at(document, place, value):
+    """Return the document with another value at this place, or without it for the value None."""
+    name, _, rest = place.partition(".")
+    if isinstance(document, list):
+        return [changed_at(one, rest, value) if number == int(name) else one for number, one in enumerate(document)]
+    if not rest:
+        return {key: one for key, one in document.items() if key != name} | ({} if value is None else {name: value})
+    return document | {name: changed_at(document[name], rest, value)}
+
+
+@pytest.mark.parametrize(("place", "value", "said"), [
+    ("coulomb_nm.value", 30.0, "coulomb_nm.value is 61.2, not 30.0"),
+    ("speed_lag_s.high", 0.40, "speed_lag_s.high is 0.42, not 0.4"),
+    ("torque_scale_rel_sd", 0.005, "torque_scale_rel_sd is 0.02, not 0.005"),
+    ("inertia_main_shaft_kg_m2.value", 415.9, "inertia_main_shaft_kg_m2.value is 416.0, not 415.9"),
+    ("residual.p_value", 0.96, "residual.p_value is 0.36, not 0.96"),
+    ("samples_used", 10**400, "samples_used is 3000, not 1000"),
+    ("acceptance.verdict", "pass", "acceptance.verdict is 'fail', not 'pass'"),
+    ("acceptance.checks", [], "acceptance.checks is [{'name': 'inertia', 'passed': False}], not []"),
+    ("acceptance", None, "'acceptance' is found and not stated"), ("praise", "x", "'praise' is stated and not found"),
+    ("warnings", ["one", "three"], "warnings is 'two', not 'three'"),
+])
+def test_every_part_of_the_stated_result_follows_from_the_log(tmp_path, place, value, said):
+    """Friction, lags, torque scale, J at the main shaft, residual and acceptance were not compared."""
+    stated = changed_at(WHOLE, place, value)
+    log = write_run(tmp_path / "run.mcap", result=WHOLE)
+    forged = make_evidence(log, STATEMENT, (), conclude=lambda log: stated).archive
+    (problem,) = problems(forged, conclude=lambda log: WHOLE)
+    assert problem.startswith(f"the result does not follow from run.mcap: {said}")
+
+
+@pytest.mark.parametrize(("place", "value"), [
+    ("coulomb_nm.value", 61.2 * (1 + 1e-9)), ("skew_s.value", -1e-9), ("backlash", None),
+    ("second_opinions.0.note", "4 changes"),
+])
+def test_a_result_may_differ_in_rounding_and_in_keys_of_a_later_state(tmp_path, place, value):
+    log = write_run(tmp_path / "run.mcap", result=WHOLE)
+    archive = make_evidence(log, STATEMENT, (), conclude=lambda log: changed_at(WHOLE, place, value)).archive
+    assert problems(archive, conclude=lambda log: WHOLE) == ()
+
+
+@pytest.mark.parametrize(("place", "value", "said"), [
+    ("coulomb_nm.value", 61.5, ""), ("coulomb_nm.value", 70.0, "coulomb_nm.value is 61.2, not 70.0"),
+    ("acceptance.verdict", "pass", "acceptance.verdict is 'fail', not 'pass'"), ("warnings", ["one", "2"], ""),
+    ("acceptance", None, ""), ("praise", "x", ""),
+])
+def test_a_result_of_another_version_may_have_other_texts_and_keys(tmp_path, monkeypatch, place, value, said):
+    log = write_run(tmp_path / "run.mcap", result=WHOLE)
+    monkeypatch.setattr("tdhil.evidence.making.__version__", "0.0.9")
+    archive = make_evidence(log, STATEMENT, (), conclude=lambda log: changed_at(WHOLE, place, value)).archive
+    monkeypatch.undo()
+    assert [one.rpartition("run.mcap: ")[2] for one in problems(archive, conclude=lambda log: WHOLE)] == (
+        [said] if said else [])
 
 
 def test_bytes_beside_the_members_are_found(made):

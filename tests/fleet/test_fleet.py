@@ -17,6 +17,7 @@ import pytest
 
 from tdhil import process_pool
 from tdhil.cli import fleet as fleet_command
+from tdhil.cli.fleet import _result_text
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet import (
@@ -118,7 +119,7 @@ def test_a_result_from_a_part_of_a_run_is_marked(few, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.rpartition(" %")[2] for line in lines] == [
         "", "", "", ", aborted in stage acquire (DriveFault)", ", log cut short"]
-    assert re.search(r"^SIMULATED .*0.mcap: valid\w*, J \d+\.?\d* \(", lines[0])
+    assert re.search(r"^SIMULATED .*0.mcap: valid\w*, J, 95 % interval: \d+\.?\d* \(", lines[0])
     assert max(len(number) for number in re.findall(r"[\d.]+ to|to [\d.]+", lines[0])) <= len("104.5 to")
 
 
@@ -406,6 +407,14 @@ def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
         run_fleet(replace(request, again=True), function=poison.quick)
 
 
+def test_a_result_is_printed_with_the_coverage_of_its_interval():
+    """With --confidence 0.5, intervals of 50 % looked like those of 95 %."""
+    row = FleetRow("run.mcap", "valid", inertia_kg_m2=104.0, inertia_low_total_kg_m2=100.0,
+                   inertia_high_total_kg_m2=108.0, confidence=0.5)
+    assert _result_text(row) == "valid, J, 50 % interval: 104.0 (100.0 to 108.0) kg·m²  ±3.9 %"
+    assert _result_text(replace(row, confidence=None)).startswith("valid, J 104.0 (")      # a row without it
+
+
 def test_a_run_refused_before_motion_is_no_failure_of_the_fleet(tmp_path):
     """The log run.refused.mcap of tdhil is complete. It has no result, and none is expected."""
     rows = (FleetRow("run.mcap", "valid"),
@@ -436,7 +445,7 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     assert main(arguments) == 3
     text = capsys.readouterr().out
     assert "7 logs (7 of them finished before)" in text
-    assert re.search(r"R1-000.mcap: valid\w*, J \d", text)
+    assert re.search(r"R1-000.mcap: valid\w*, J, 95 % interval: \d", text)
     assert "empty.mcap: the file is empty" in text
     assert "skipped: 1 CSV file without" in text
     for wrong in (["--jobs", "0"], ["--confidence", "1.5"], ["--time-limit", "0"], ["--memory-limit", "1"]):

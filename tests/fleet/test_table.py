@@ -75,7 +75,8 @@ def test_every_column_has_its_place_in_the_document():
 
 
 def test_every_quantity_has_its_unit():
-    units = ("_kg_m2", "_nm_s_rad", "_nm_rad", "_nm", "_s", "_hz", "_rel_sd", "_ratio", "_value", "confidence")
+    units = ("_kg_m2", "_nm_s_rad", "_nm_rad", "_nm", "_s", "_hz", "_rel_sd", "_ratio", "_factor", "_value",
+             "confidence")
     assert [name for name, kind in COLUMNS.items() if kind is float and not name.endswith(units)] == []
     assert {one.name for one in fields(FleetRow)} == set(COLUMNS)
 

@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +13,7 @@ import pytest
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet.change_detection import Difference
-from tdhil.fleet.rows import FleetRow, FleetSettings, row_of
+from tdhil.fleet.rows import FleetRow, FleetSettings, row_from_json, row_of
 from tdhil.fleet.table import write_table
 from tdhil.fleet.trend import _change_text, _differences, scale_of, trend_document
 from tests.fleet.drawn_histories import draw
@@ -203,6 +203,33 @@ def test_runs_before_and_after_a_calibration_are_kept_apart():
     together, said = inertia(found[:half] + plain)
     assert len(together["changes"]) == 1 and "torque calibrations" not in said
     assert scale_of(after[0]) != scale_of(found[0]) == scale_of(plain[0])
+
+
+def test_two_calibrations_from_the_same_logs_are_two_torque_scales():
+    """A recalculation with another added inertia has the same date. Its factor changes J, and no shaft has changed."""
+    day = "2026-01-12T10:00:00+00:00"
+
+    def run(factor, day=day):
+        document = {"verdict": "valid", "rig": {"name": "R7"}, "date": "2026-02-01T08:00:00+00:00", "simulated": False,
+                    "drive": {"vendor": 1, "product": 2, "serial": 7},
+                    "inertia_kg_m2": {"value": 104.0 * factor, "low": 103.0 * factor, "high": 105.0 * factor,
+                                      "confidence": 0.95},
+                    "torque_calibration": {"factor": factor, "low": 0.99 * factor, "high": 1.01 * factor,
+                                           "rel_sd": 0.005, "date": day}}
+        return row_of(f"{factor}.mcap", document, settings=FleetSettings())
+
+    first, other = run(0.997), run(1.133)
+    assert (first.torque_calibration, first.torque_calibration_factor) == (day, 0.997)
+    found = _differences(first, other)
+    assert not found["quantities"][0]["shared_scale"]
+    assert found["text"].endswith("two torque calibrations: the scale of each is in it")
+    (note,) = trend_document([first, other])["notes"]
+    assert "different torque calibrations (2026-01-12 (factor 0.997), 2026-01-12 (factor 1.133))" in note
+    same = _differences(first, replace(run(0.997), log="again.mcap"))
+    assert same["quantities"][0]["shared_scale"] and "torque scale cancels" in same["text"]
+    # a row of an earlier version has the date only
+    old = row_from_json({name: value for name, value in asdict(first).items() if name != "torque_calibration_factor"})
+    assert scale_of(old) == scale_of(replace(old, log="b.mcap")) != scale_of(first)
 
 
 def test_dates_of_the_picture_of_a_trend_are_legible(tmp_path):

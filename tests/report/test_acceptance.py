@@ -1,7 +1,9 @@
 """Acceptance of expected values: pass, fail or undecided by the interval, and deviations in words."""
 
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from drivers import DataFileError
@@ -57,6 +59,33 @@ def test_the_gains_of_a_run_without_j_need_95_percent_too():
     assert judged(found, {"gain": (300.0, 30.0)})["verdict"] == "cannot tell"
     found["frequency_response"]["confidence"] = 0.95
     assert judged(found, {"gain": (300.0, 30.0)})["verdict"] == "pass"
+
+
+@pytest.mark.parametrize(("low", "high", "text"), [
+    (1222.2, 1246.8, "pass: expected 1234.5 ± 12.349 kg·m², identified 1235.0 (1222.2 to 1246.8) kg·m²"),
+    (1222.2, 1247.0, "cannot tell: expected 1234.5 ± 12.349 kg·m², identified 1235 (1222 to 1247) kg·m²"),
+    (1246.8491, 1270.0, "fail: expected 1234.5 ± 12.349 kg·m², identified 1235.0000 (1246.8491 to 1270.0000) kg·m²"),
+])
+def test_the_printed_interval_never_contradicts_the_printed_verdict(low, high, text):
+    """With ± 12.3 and (1222 to 1247), a reader finds another verdict for the first one."""
+    found = {"inertia_kg_m2": {"value": 1235.0, "low_total": low, "high_total": high}}
+    assert judged(found, {"inertia": (1234.5, 12.349)})["quantities"][0]["text"] == text
+
+
+def test_printed_numbers_give_the_verdict_for_any_size():
+    """2 000 intervals, each with an end near a limit."""
+    rng = np.random.default_rng(5)
+    for expected, share, half, near in zip(10 ** rng.uniform(-4, 5, 2000), rng.uniform(0.005, 0.2, 2000),
+                                           10 ** rng.uniform(-2, 1, 2000), rng.normal(0.0, 1e-3, 2000), strict=True):
+        tolerance = share * expected
+        end = expected + tolerance * (1.0 + near)
+        low, high = (end - half * tolerance, end) if rng.random() < 0.5 else (end, end + half * tolerance)
+        part = {"value": 0.5 * (low + high), "low_total": low, "high_total": high}
+        (row,) = judged({"inertia_kg_m2": part}, {"inertia": (expected, tolerance)})["quantities"]
+        limits, ends = re.fullmatch(r"[a-z ]+: expected (.*) kg·m², identified .*\((.*)\) kg·m²", row["text"]).groups()
+        (middle, around), (bottom, top) = map(float, limits.split(" ± ")), map(float, ends.split(" to "))
+        inside, apart = middle - around <= bottom and top <= middle + around, bottom > middle + around
+        assert row["verdict"] == ("pass" if inside else "fail" if apart else "cannot tell"), row["text"]
 
 
 @pytest.mark.parametrize(("changed", "name", "words"), [

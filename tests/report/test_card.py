@@ -11,6 +11,7 @@ from rich.console import Console
 from profiles.quantities import printed_interval, printed_share
 from tdhil.report.blocks import report_of
 from tdhil.report.card import (
+    budget_figures,
     card_text,
     estimate_text,
     inertia_text,
@@ -18,7 +19,7 @@ from tdhil.report.card import (
     print_card,
 )
 from tdhil.report.document import result_document
-from tdhil.report.intervals import percent, plus_minus, plus_minus_part, table_cell, two_digits, with_interval
+from tdhil.report.intervals import percent, plus_minus, plus_minus_part, table_cell, with_interval
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
 
@@ -98,9 +99,12 @@ def test_digits_follow_the_half_width():
     assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±13 %", "±0.034 %"]
 
 
-def test_a_half_width_has_two_digits_and_no_exponent():
-    assert [two_digits(one) for one in (1234.0, 49.4, 6.43, 0.304, 7.9e-5, 0.0)] == [
-        "1200", "49", "6.4", "0.30", "0.000079", "0"]
+def test_both_figures_of_a_budget_have_two_digits_rounded_up_and_no_exponent():
+    """Beside 3.95 %, which was rounded up to 4.0, 4.11 kg·m² was rounded to the nearest."""
+    assert [budget_figures(one, None)[0] for one in (1234.0, 49.4, 6.43, 0.304, 7.9e-5, 0.0)] == [
+        "1300", "50", "6.5", "0.31", "0.000079", "0"]
+    assert budget_figures(4.11, 104.0) == ("4.2", "4.0")
+    assert budget_figures(None, 104.0) == ("open", "") and budget_figures(4.0, None) == ("4.0", "")
 
 
 def test_a_cell_of_a_table_rounds_its_interval_outwards_and_writes_no_powers_of_ten():

@@ -15,6 +15,7 @@ from tdhil.report import Letterhead, clean_logo
 from tdhil.report.acceptance import signature_rows
 from tdhil.service.acceptance_signature import AcceptanceSignature, hash_of
 from tdhil.service.annotations import Annotations, tags_of
+from tdhil.service.audit import Audit
 from tdhil.service.letterhead import stored_letterhead
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import State, now, way_to
@@ -206,6 +207,36 @@ def test_a_person_signs_the_verdict_and_the_log_once_and_the_audit_has_it(call, 
     assert "the log is not the signed one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
 
 
+@pytest.mark.parametrize(("change", "words"), [
+    ({"verdict": "pass"}, "its verdict is pass, and the verdict of the acceptance is fail"),
+    ({"name": "B. Manager"}, "differs from its entry in the audit: name"),
+    ({"by": "root", "at": "2026-01-01T00:00:00.000Z", "remark": "agreed"}, "the audit: account, time, remark"),
+    ({"role": "viewer"}, "the audit: role"), (None, ""),
+])
+def test_a_signature_that_was_changed_on_the_disk_is_not_valid(call, service, change, words):
+    """Only the hashes of log and acceptance were compared: verdict and name of a signature could be edited."""
+    run, sent = accepted(call, service, "fail")
+    signature = call("POST", f"/runs/{run}/acceptance", 200, json={**sent, "remark": "bearing"})["signature"]
+    write_json(service.store.place(run) / "acceptance_signed.json", {**signature, **(change or {})})
+    found = call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+    assert words in found and bool(found) is bool(words)
+
+
+def test_a_signature_without_an_intact_entry_in_the_audit_is_not_valid(call, service):
+    run, sent = accepted(call, service)
+    call("POST", f"/runs/{run}/acceptance", 200, json=sent)
+    service.audit.note("anna", "acceptance signed", run="another", name="Berta")
+    assert call("GET", f"/runs/{run}/acceptance", 200)["problem"] == ""
+    (lines,) = service.audit._folder.glob("*.jsonl")
+    before = lines.read_bytes()
+    signature = json.loads((service.store.place(run) / "acceptance_signed.json").read_bytes())
+    write_json(service.store.place(run) / "acceptance_signed.json", {**signature, "name": "B. Manager"})
+    lines.write_bytes(before.replace(b"Anna Berg", b"B. Manager"))       # both are edited, without the key
+    assert "the audit has no intact entry" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+    lines.write_bytes(b"".join(line for line in before.splitlines(keepends=True) if b"acceptance signed" not in line))
+    assert "the audit has no intact entry" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
+
+
 @pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("verdict", ["fail", "cannot tell"])
 def test_a_verdict_other_than_pass_is_signed_with_a_remark_only(call, service, verdict):
@@ -325,6 +356,9 @@ def test_a_letterhead_that_is_not_accepted_names_each_field_and_changes_nothing(
 def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path, monkeypatch):
     from tdhil.service.worker import _signed
 
+    audit, tmp_path = Audit(tmp_path / "audit"), tmp_path / "runs" / "one"
+    audit._folder.mkdir()
+    tmp_path.mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     document = {"acceptance": ACCEPTANCE}
     (tmp_path / "run.mcap").write_bytes(b"log")
@@ -333,6 +367,8 @@ def test_the_worker_puts_the_signature_into_the_document_of_the_report(tmp_path,
     signature = AcceptanceSignature("Anna", "engineer", "anna", "2026-05-01T12:30:00.123Z", "", "pass", digest,
                                     hash_of(ACCEPTANCE))
     write_json(tmp_path / "acceptance_signed.json", asdict(signature))
+    assert "no intact entry" in dict(signature_rows(_signed(document)["acceptance"]))["signature not valid"]
+    audit.note("anna", "acceptance signed", run="one", **asdict(signature))
     rows = dict(signature_rows(_signed(document)["acceptance"]))
     assert rows["signed by"] == "Anna (engineer, account anna)" and rows["SHA-256 of the log"] == digest
     assert rows["date"] == "2026-05-01 12:30:00 UTC"

@@ -118,14 +118,19 @@
   }
 
   const number = (value, digits = 4) => (value === null || value === undefined ? "–" : local(Number(value).toPrecision(digits).replace(/\.?0+$/, (m) => (m.includes(".") ? "" : m))));
-  /** Format a value with its interval: two digits of the half-width, as on the terminal's card. */
-  function interval(value, low, high) {
-    if (value === null || value === undefined) return null;
-    if (low === null || low === undefined || high === null || high === undefined || low === high) return number(value);
-    const half = (high - low) / 2, places = half > 0 ? Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(half)))) : 4;
+  /** Round a value and its interval as the terminal's card: two digits of the half-width, and more; tens and hundreds too. */
+  function rounded(value, low, high, more = 0) {
+    const half = (high - low) / 2, places = half > 0 ? Math.min(12, 1 - Math.floor(Math.log10(half)) + more) : 4, step = 10 ** -places;
     // the ends are rounded outwards; 1e-6 of the last digit is the rounding of the arithmetic
-    const step = 10 ** -places, down = Math.floor(low / step + 1e-6) * step, up = Math.ceil(high / step - 1e-6) * step;
-    return tr("{value} ({low} to {high})", { value: fixed(value, places), low: fixed(down, places), high: fixed(up, places) });
+    const whole = { value: places < 0 ? Math.round(value / step) * step : value, low: Math.floor(low / step + 1e-6) * step, high: Math.ceil(high / step - 1e-6) * step };
+    return { places: Math.max(0, places), ...whole };
+  }
+  function interval(value, low, high, more = 0) {
+    if (value === null || value === undefined) return null;
+    if (low === null || low === undefined || high === null || high === undefined) return number(value);
+    if (low === high) return number(value, 5 + more);
+    const at = rounded(value, low, high, more);
+    return tr("{value} ({low} to {high})", { value: fixed(at.value, at.places), low: fixed(at.low, at.places), high: fixed(at.high, at.places) });
   }
   const withUnit = (text) => (text === null ? null : `${text} kg·m²`);
   const inertia = (one) => (one ? withUnit(interval(one.inertia_kg_m2, one.low_kg_m2, one.high_kg_m2)) : null);
@@ -985,7 +990,7 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, shareOf, show, span, speedUnit, stateText, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, rounded, shareOf, show, span, speedUnit, stateText, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);

@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const { byLabels, coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, shareOf, show, span, speedUnit, stateText, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, rounded, shareOf, show, span, speedUnit, stateText, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
@@ -50,15 +50,24 @@
   function accepted(result) {
     const found = result && result.acceptance;
     if (!found) return [];
-    const short = (value) => local(String(Number(value.toPrecision(5))));
+    const short = (value, more) => Number(value.toPrecision(5 + more));
+    const judged = (expected, tolerance, low, high) => (expected - tolerance <= low && high <= expected + tolerance ? "pass" : high < expected - tolerance || expected + tolerance < low ? "fail" : "");
+    /** The least digits beyond the usual with which the shown numbers give the verdict, as in the report. */
+    const digits = (one) => [0, 1, 2, 3].find((more) => {
+      const at = rounded(one.value, one.low, one.high, more);
+      const ends = one.low === one.high ? [short(one.value, more), short(one.value, more)] : [at.low, at.high].map((end) => Number(end.toFixed(at.places)));
+      return judged(short(one.expected, more), short(one.tolerance, more), ...ends) === judged(one.expected, one.tolerance, one.low, one.high);
+    }) ?? 4;
+    const limits = (one, more) => `${local(String(short(one.expected, more)))} ± ${local(String(short(one.tolerance, more)))} ${one.unit}`;
+    const more = new Map(found.quantities.map((one) => [one, typeof one.value === "number" && one.low !== null && one.high !== null ? digits(one) : 0]));
     const wide = found.quantities.some((one) => !["pass", "fail"].includes(one.verdict) && one.value !== null);
     return [el("section", { class: "card" }, el("h2", {}, tr("Acceptance")),
       el("p", { class: `verdict ${ACCEPTED[found.verdict] || "fair"}` }, word(found.verdict, "verdict")),
       ...found.off.map((one) => el("p", { class: "alarm" }, ...coded(found.code, `${one} [${found.code}]`))),
       region(tr("Acceptance"), el("table", { class: "whole" }, el("thead", {}, el("tr", {}, ...[tr("quantity"), tr("expected"), tr("identified"), tr("verdict")].map((one) => el("th", { scope: "col" }, one)))),
         el("tbody", {}, ...found.quantities.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.label)),
-          el("td", {}, typeof one.expected === "string" ? one.expected : `${short(one.expected)} ± ${short(one.tolerance)} ${one.unit}`),
-          el("td", {}, one.value === null ? tr("not identified") : typeof one.value === "string" ? one.value : `${of(one)} ${one.unit}`),
+          el("td", {}, typeof one.expected === "string" ? one.expected : limits(one, more.get(one))),
+          el("td", {}, one.value === null ? tr("not identified") : typeof one.value === "string" ? one.value : `${interval(one.value, one.low, one.high, more.get(one))} ${one.unit}`),
           el("td", { class: `verdict ${ACCEPTED[one.verdict] || "fair"}` }, word(one.verdict, "verdict"))))))),
       wide ? el("p", {}, tr("An interval overlaps the edge of its tolerance. Calibrate the torque, or measure for longer.")) : null)];
   }
@@ -77,6 +86,11 @@
   const ENDED_EARLY = "TDH-030";
   const VERDICTS = { valid: "good", valid_wide: "fair", not_identifiable: "bad", model_rejected: "bad" };
 
+  /** A half-width with two digits, rounded up. */
+  function halfWidth(half) {
+    const at = rounded(0, -half, half);
+    return half > 0 ? fixed(at.high, at.places) : number(half, 2);
+  }
   /** The uncertainty budget as bars, the largest contribution first; an open one has no bar. */
   function budgetOf(result) {
     const lines = [...((result && result.budget) || [])].sort((a, b) => (b.half_width_kg_m2 ?? Infinity) - (a.half_width_kg_m2 ?? Infinity));
@@ -84,7 +98,7 @@
     const most = Math.max(...lines.map((one) => one.half_width_kg_m2 ?? 0));
     return [el("section", {}, el("h2", {}, tr("Uncertainty budget")), region(tr("Uncertainty budget"), el("table", { class: "budget" },
       el("tbody", {}, ...lines.map((one) => el("tr", {}, el("th", { scope: "row" }, word(one.source, "budget")),
-        el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`),
+        el("td", {}, `± ${halfWidth(one.half_width_kg_m2)} kg·m²`),
         el("td", {}, el("meter", { min: 0, max: most || 1, value: one.half_width_kg_m2 ?? 0, "aria-label": tr("share of the largest: {source}", { source: word(one.source, "budget") }) })),
         el("td", { class: "dim" }, english(one.note))))))), el("p", { class: "dim said" }, byId("budget").dataset.said))];
   }

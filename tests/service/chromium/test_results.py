@@ -14,6 +14,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from tdhil.config import Expectation
 from tdhil.errors import UsageError
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import Told, now
@@ -251,6 +252,32 @@ def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_sig
     page.reload()
     page.get_by_text("The signature is not valid: the log is not the signed one").wait_for()
     assert page.evaluate("window.pwned") is None
+
+
+@pytest.mark.heavy
+def test_numbers_of_a_result_have_the_digits_of_the_card(page, served):
+    """The page printed 3004 (2884 to 3124) where the card prints 3000 (2880 to 3130)."""
+    from tdhil.report.acceptance import acceptance_of
+    from tdhil.report.card import budget_figures
+    from tdhil.report.intervals import with_interval
+
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    wait_for("its end", lambda: not served.service.supervisor.live())
+    path = served.service.store.place(run) / "result.json"
+    J = {"value": 1235.0, "low_total": 1222.2, "high_total": 1246.8, "low": 1222.2, "high": 1246.8}
+    acceptance = acceptance_of([Expectation("inertia", 1234.5, 12.349)], {"inertia_kg_m2": J})
+    halves = (4.11, 1234.0, 0.0304)
+    write_json(path, {**json.loads(path.read_bytes()), "acceptance": acceptance, "budget": [
+        {"source": f"source {half}", "half_width_kg_m2": half, "note": ""} for half in halves]})
+    page.goto(f"/runs/{run}")
+    page.get_by_text("1234.5 ± 12.349 kg·m²").wait_for()
+    page.get_by_text("1235.0 (1222.2 to 1246.8) kg·m²").wait_for()
+    for half in halves:
+        page.get_by_text(f"± {budget_figures(half, 104.0)[0]} kg·m²", exact=True).wait_for()
+    for one in ((3004.2, 2884.3, 3123.7), (1234.0, 1111.0, 1357.0), (104.2, 100.14, 108.26), (5.0, -12000.0, 12345.0),
+                (0.0123456, 0.0121, 0.0126), (104.0, 103.55, 104.45), (400.04, 400.04, 400.04)):
+        assert page.evaluate("one => window.tdhil.interval(...one)", one) == with_interval(*one, "").rstrip()
 
 
 @pytest.mark.heavy
