@@ -43,9 +43,9 @@ def can_scripts() -> dict[str, bytes]:
     record = struct.Struct("<BBBB8s").pack
     return {
         "nothing": b"",
-        "emergency": record(165, 0, 2, 8, bytes.fromhex("0573010000000000")),
-        "boot_up": record(170, 0, 8, 1, bytes(8)),
-        "stopped": record(160, 0, 8, 1, b"\x05" + bytes(7)) + record(9, 0, 8, 1, b"\x04" + bytes(7)),
+        "emergency": record(185, 0, 2, 8, bytes.fromhex("0573010000000000")),
+        "boot_up": record(190, 0, 8, 1, bytes(8)),
+        "stopped": record(180, 0, 8, 1, b"\x05" + bytes(7)) + record(9, 0, 8, 1, b"\x04" + bytes(7)),
         "abort": record(20, 5, 0, 8, b"\x80\0\0\0\0\0\0\0") + record(30, 3, 0, 0, bytes(8)),
         "late": record(40, 4, 0, 0, bytes(8)) * 3,
         "short": record(60, 7, 0, 3, bytes(8)) + record(20, 0, 3, 2, bytes(8)),
