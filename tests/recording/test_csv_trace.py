@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tdhil.errors import CsvMisnamed, CsvUnusable, ExitCode, UsageError, exit_code
 from tdhil.recording.csv import reader as csv_trace
@@ -135,6 +137,17 @@ REFUSED = {
     "per cent of nothing": ("time_s,speed_rad_s,torque_pct\n0,1,2\n", (), 2, "--rated-torque"),
     "decimal commas between commas": (HEAD + "0,0,1,5,2,5\n" * 50, (), 10, "decimal commas the separator must be"),
     "both decimal signs": ("time_s;speed_rad_s;torque_nm\n0;1,5;2.5\n", (), 10, "trace.csv:2: some numbers have"),
+    "thousands or decimals, in one column": (
+        "Zeit [ms];n [1/min];M [Nm]\n0;1.198;70\n10;1.206;73\n", ("time=Zeit", "speed=n", "torque=M"), 10,
+        "trace.csv:2: the point in '1.198', of column 'n [1/min]', may be a decimal sign or may separate thousands"),
+    "thousands beside integers": (
+        "time_ms;speed_rpm;torque_nm\n0;998;70.125\n10;1.002;71.375\n", (), 10, "the point in '1.002', of column"),
+    "thousands after a long standstill": (
+        "time_ms;speed_rpm;torque_nm\n" + "".join(f"{n};0;5\n" for n in range(6000)) + "6000;1.002;5\n", (), 10,
+        "the point in '1.002', of column 'speed_rpm'"),
+    "English thousands between tabs": (
+        "time_ms\tspeed_rpm\ttorque_nm\n0\t1,198\t70\n10\t1,206\t73\n", (), 10,
+        "the comma in '1,198', of column 'speed_rpm'"),
     "words for numbers": (HEAD + ROWS + "1,a,b\n" * 50, (), 10, "trace.csv:102: 50 rows have something else"),
     "shuffled": (HEAD + "".join(f"{n * 37 % 101},1,2\n" for n in range(101)), (), 10, "the time goes back"),
     "too coarse": (HEAD + "".join(f"{n // 10},1,2\n" for n in range(200)), (), 10, "the time repeats itself"),
@@ -226,3 +239,64 @@ def test_resolution_is_the_count_of_a_rounded_signal():
     assert resolution(np.round(wave, 1) * RPM) == pytest.approx(0.1 * RPM)
     assert resolution(wave) < 1e-3
     assert resolution(np.ones(5)) == 0.0
+
+
+def grouped(number, sign):
+    return f"{number:,}".replace(",", sign)
+
+
+def outcome(folder, cells, *, delimiter=";", head=("time_ms", "speed_rpm", "torque_nm")):
+    """Return the speed and torque of a table as they are read, in rpm and N·m, or 'refused'."""
+    path = folder / "any.csv"
+    path.write_text("\n".join(delimiter.join(row) for row in [head, *cells]) + "\n", encoding="utf-8")
+    try:
+        trace = read_trace(path)
+    except CsvUnusable as error:
+        assert "may separate thousands" in str(error)
+        return "refused"
+    return trace.speed_rad_s / RPM, trace.torque_nm
+
+
+@settings(max_examples=60, deadline=None)
+@given(speeds=st.lists(st.integers(-30_000, 30_000), min_size=2, max_size=8),
+       torques=st.lists(st.integers(-999, 999), min_size=8, max_size=8), swapped=st.booleans(),
+       sign=st.sampled_from(".,"), delimiter=st.sampled_from(";\t"))
+def test_a_whole_number_with_thousands_is_never_read_as_a_thousandth(tmp_path_factory, speeds, torques, swapped, sign,
+                                                                     delimiter):
+    speeds = [*speeds, 1200]
+    rows = [(str(10 * n), *([grouped(speed, sign), str(torque)][::-1 if swapped else 1]))
+            for n, (speed, torque) in enumerate(zip(speeds, torques, strict=False))]
+    rows.append((str(10 * len(rows)), *([grouped(1200, sign), "5"][::-1 if swapped else 1])))
+    assert outcome(tmp_path_factory.getbasetemp(), rows, delimiter=delimiter) == "refused"
+
+
+# name: format of the time in ms, of the speed and of the torque
+DECIMALS = {"three decimals in both": ("{:.0f}", "{:.3f}", "{:.3f}"), "in all": ("{:.3f}", "{:.3f}", "{:.3f}"),
+            "another number of decimals in one": ("{:.0f}", "{:.3f}", "{:.2f}"),
+            "more decimals": ("{:.0f}", "{:.4f}", "{:.0f}")}
+
+
+@pytest.mark.parametrize("comma", [False, True])
+@pytest.mark.parametrize("name", DECIMALS)
+@settings(max_examples=25, deadline=None)
+@given(values=st.lists(st.tuples(st.floats(1.0, 999.0), st.floats(-999.0, 999.0)), min_size=2, max_size=8))
+def test_a_fixed_number_of_decimals_is_read(tmp_path_factory, name, comma, values):
+    rows = [[text.format(value) for text, value in zip(DECIMALS[name], (2000.0 + 10.0 * n, *pair), strict=True)]
+            for n, pair in enumerate(values)]
+    written = np.array([[float(cell) for cell in row] for row in rows])
+    if comma:
+        rows = [[cell.replace(".", ",") for cell in row] for row in rows]
+    found = outcome(tmp_path_factory.getbasetemp(), rows)
+    assert found != "refused"
+    np.testing.assert_allclose(np.transpose(found), written[:, 1:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("rows", [
+    [("12.340", "1.198", "70"), ("12.350", "1.206", "73")],       # a time in s is no whole number of seconds
+    [("0", "0.125", "70"), ("10", "1.125", "73")], [("0", "1.198", "70"), ("10", "1.2", "73")],
+    [("0", "1200", "70"), ("10", "1.206", "73")],                 # this column has no signs between thousands
+])
+def test_three_decimals_beside_whole_numbers_are_read_if_one_cell_shows_the_sign(tmp_path, rows):
+    head = ("time_s" if "." in rows[0][0] else "time_ms", "speed_rpm", "torque_nm")
+    speed, _ = outcome(tmp_path, rows, head=head)
+    np.testing.assert_allclose(speed, [float(row[1]) for row in rows], rtol=1e-9)

@@ -12,7 +12,7 @@ from itertools import chain, islice
 
 from profiles import quantities
 from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, shown
-from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, split_cells
+from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, perhaps_thousands, split_cells
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Units that the tools of drives write, and their values in SI.
@@ -348,11 +348,11 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
         (row for at, row in rows.items() if at < first and _states_units(quantities, row)), [""] * len(choices)
     )
     clock = ":" in rows[first][0]
-    # the first lines, and some later ones with a comma if it is no separator: at standstill all values are 0
-    later = (line for line in lines[first + _LOOKED_AT:] if "," in line) if header.delimiter != "," else ()
-    seen = [_wanted(line, header)
-            for line in chain(lines[first:first + _LOOKED_AT], islice(later, _LOOKED_AT))]
-    sign = decimal_sign(row[1:] if clock else row for row in seen)
+    # the first lines, and some later ones with a sign that is no separator: at standstill all values are 0
+    later = chain.from_iterable(islice((line for line in lines[first + _LOOKED_AT:] if sign in line), _LOOKED_AT)
+                                for sign in ",." if header.delimiter != ",")
+    seen = [_wanted(line, header)[clock:] for line in chain(lines[first:first + _LOOKED_AT], later)]
+    sign = decimal_sign(seen)
     if sign == "?":
         raise CsvUnusable(
             "some numbers have a decimal comma and some a decimal point", where=f"{file}:{first + 1}",
@@ -369,6 +369,17 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
         unit, notes = _unit(choice, name, stated[position], where, _flag(choices))
         units.append(unit)
         assumed += [f"{file}: {note}" for note in notes]
+    # a table with commas between its cells has no points between thousands, and a drive's trace no steps of 1 s
+    if (sign == "," or header.delimiter != ",") and (clock or units[0].factor < 1.0 or not any(
+            sign in row[0] for row in seen)) and (doubt := perhaps_thousands(seen)) is not None:
+        at, cell = doubt
+        name, word = shown(header.names[header.columns[at + clock]]), "comma" if sign == "," else "point"
+        raise CsvUnusable(
+            f"the {word} in {cell!r}, of column {name!r}, may be a decimal sign or may separate thousands",
+            where=f"{file}:{first + 1}",
+            next_step=f"Export again without signs between thousands. If the {word} is the decimal sign, write one "
+            f"number of this column with four decimals in a copy of the file, such as {cell}0",
+        )
     return ColumnLayout(header, first + 1, tuple(units), clock, sign == ",", tuple(assumed))
 
 
