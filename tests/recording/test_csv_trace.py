@@ -54,6 +54,11 @@ EXPORTS = {
                                ("'torque_target_nm' is a setpoint, a limit or an error by its name",)),
     "a unit that is told": ("time_s,speed_rad_s,Torque [% Mn]\n0,1,50\n1,2,10\n", "utf-8", ("torque=Torque:%",), 480.0,
                             [0, 1], [1, 2], [240, 48], ()),
+    "letters of axes and phases, and SI before other words": (
+        "time_s,speed_w,m_nm_filtered\n0,1,2\n1,2,3\n", "utf-8", ("speed=speed_w", "torque=m_nm_filtered"), None,
+        [0, 1], [1, 2], [2, 3], ("rad/s was assumed", "N·m was assumed")),
+    "a current that is told to be a torque": (
+        "time_s,speed_rad_s,I_A\n0,1,2\n1,2,3\n", "utf-8", ("torque=I_A:Nm",), None, [0, 1], [1, 2], [2, 3], ()),
     "speed in 1/min, not the least speed": ("time_s,speed_1/min,torque_nm\n0,60,2\n1,61,3\n", "utf-8", (), None,
                                             [0, 1], [60 * RPM, 61 * RPM], [2, 3], ()),
     "feet and turns": ("a;b;c\nmin;Hz;lbf·ft\n0;1;1\n1;2;-2\n", "utf-8", ("time=a", "speed=b", "torque=c"), None,
@@ -124,7 +129,7 @@ REFUSED = {
     "unknown unit in the name": ("time_s,speed_rad_s,Torque [% Mn]\n0,1,2\n", (), 2,
                                  "'% Mn', of column 'Torque [% Mn]', is not a unit of torque; use N·m, mN·m"),
     "unknown unit of the speed": ("time_s,Speed [0.1 rpm],torque_nm\n0,1,2\n", (), 2,
-                                  "Give it behind a colon: --columns speed='Speed [0.1 rpm]:rad/s'"),
+                                  "state this unit behind a colon: --columns speed='Speed [0.1 rpm]:…'"),
     "mega and not milli": ("time_s,speed_rad_s,torque [MNm]\n0,1,2\n", (), 2, "is not a unit of torque"),
     "unknown units below": ("time,speed,torque\n[tick],[inc],[1/1000 Mn]\n0,1,2\n", (), 2,
                             "is not a unit of time"),
@@ -133,6 +138,15 @@ REFUSED = {
                                     "an error")
        for name in ("torque_limit_nm", "torque_setpoint_nm", "Torque demand [Nm]", "torque_cmd_%", "target torque [Nm]",
                     "TorqueRef [Nm]", "Solltorque [Nm]")},
+    **{f"a current: {name}": (f"time_s,speed_rad_s,{name}\n0,1,2\n", (f"torque={name}",), 2,
+                              "A current is not a torque. Convert the column with the torque constant of the motor")
+       for name in ("I_A", "current_a", "I [A]", "motor current [mA]", "iq_amps")},
+    **{f"not a unit of torque: {name}": (f"time_s,speed_rad_s,{name}\n0,1,2\n", (f"torque={name}",), 2,
+                                         "is not a unit of torque; use N·m")
+       for name in ("torque_pu", "torque_percent_of_rated", "torque_in_lb", "m_mnm", "torque_rpm", "m_knm_filtered")},
+    **{f"not a unit of speed: {name}": (f"time_s,{name},torque_nm\n0,1,2\n", (f"speed={name}",), 2,
+                                        "is not a unit of speed; use rad/s")
+       for name in ("speed_pct", "v_m_s", "speed_counts", "speed_rpm_x10")},
     "units at odds": ("time_s,n_rpm,torque_nm\ns,rad/s,Nm\n0,1,2\n", ("speed=n_rpm",), 2, "rpm by its name but rad/s"),
     "per cent of nothing": ("time_s,speed_rad_s,torque_pct\n0,1,2\n", (), 2, "--rated-torque"),
     "decimal commas between commas": (HEAD + "0,0,1,5,2,5\n" * 50, (), 10, "decimal commas the separator must be"),
@@ -166,6 +180,7 @@ def test_an_unreadable_export_is_refused_in_one_line(tmp_path, name):
         read_trace(path, parse_columns(columns) if columns else USUAL)
     message = str(caught.value)
     assert words in message
+    assert ":N·m'" not in message and ":rad/s'" not in message      # an example is copied, although the unit is another
     assert message.startswith(str(path))
     assert "\n" not in message
     assert exit_code(caught.value) == code

@@ -83,6 +83,37 @@ def unit_in_name(quantity: str, name: str) -> ColumnUnit | None:
     return next((unit for ending in endings if (unit := unit_of(quantity, ending)) is not None), None)
 
 
+_CURRENTS = frozenset(("a", "ma", "ka", "amp", "amps", "ampere", "amperes", "arms"))
+# Units that are not of `profiles.quantities`, as they end a name: in brackets no list is needed.
+_ODD_UNITS = _CURRENTS | frozenset((
+    "pu", "kw", "volt", "volts", "mnm", "ncm", "kgm", "kgfm", "kgcm", "kgfcm", "kpm", "inlb", "inlbs", "inlbf", "lbin",
+    "lbsin", "lbfin", "ozin", "ozfin", "inoz", "krpm", "mps", "kmh", "inc", "incs", "increments", "count", "counts",
+    "cnt", "digit", "digits", "lsb", "tick", "ticks", "sample", "samples",
+))
+
+
+def odd_unit(quantity: str, name: str) -> str:
+    """Return the unit in a column's name that is none of the quantity, else ``''``: ``I_A``, ``I [A]`` → A.
+
+    A unit of the quantity before other words counts, too, because they may change it: ``torque_percent_of_limit``. A
+    letter alone is an axis or a phase, except ``_a``.
+    """
+    base, bracketed = split_name(name)
+    if bracketed:
+        return "" if unit_of(quantity, bracketed) else bracketed
+    if unit_in_name(quantity, base) is not None:
+        return ""
+    parts = re.split(r"[_ ]", base)
+    for start in range(1, len(parts)):
+        ending, first = "_".join(parts[start:]), unit_of(quantity, parts[start])
+        word = quantities.SIGNS_IGNORED.sub("", ending.casefold())
+        other = word in _ODD_UNITS or quantities.unit_of(word) is not None
+        if (other and word not in _SETPOINT_WORDS and (len(word) > 1 or base.casefold().endswith("_a"))) or (
+                first is not None and len(parts[start]) > 1 and first.symbol != SI[quantity]):
+            return ending
+    return ""
+
+
 # Words in names of columns that are not the actual value, in English and German. `reference` is a setpoint in the trace
 # of a drive; in a calibration it is the sensor that is compared with.
 _REFERENCE_WORDS = frozenset(("ref", "reference"))
@@ -421,21 +452,22 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
         if other is not None and other != choice.unit:
             notes.append(f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}")
         return choice.unit, notes
-    next_step = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
     # SI is assumed only if the file states no unit: a unit that is not known would be a wrong factor
-    odd = stated if below is None and not is_missing(stated) else ""
-    if named is None and below is None:
-        odd = odd or split_name(name)[1]
+    odd = stated if below is None and not is_missing(stated) else odd_unit(quantity, name) if below is None else ""
+    next_step = f"behind a colon: {flag} {quantity}='{shown(name)}:…'"
     if odd:
-        raise CsvMisnamed(
-            f"{shown(odd)!r}, of column {shown(name)!r}, is not a unit of {quantity}; "
-            f"use {', '.join(known_units(quantity))}",
-            where=where, next_step=f"{next_step}, with the column's unit, or convert the column",
-        )
+        what, first = f"{shown(odd)!r}, of column {shown(name)!r}, is ", "Convert the column"
+        if quantity == "torque" and odd.casefold() in _CURRENTS:
+            what += "a unit of current. A current is not a torque"
+            first += " with the torque constant of the motor"
+        else:
+            what += f"not a unit of {quantity}; use {', '.join(known_units(quantity))}"
+        raise CsvMisnamed(what, where=where,
+                          next_step=f"{first}. If it is a {quantity} in another unit, state this unit {next_step}")
     if below is not None and named is not None and below != named:
         raise CsvMisnamed(
             f"the unit of {shown(name)!r} is {named.symbol} by its name but {below.symbol} by the row of units",
-            where=where, next_step=next_step,
+            where=where, next_step=f"State the right one {next_step}",
         )
     unit = below or named
     if unit is None:
