@@ -18,7 +18,8 @@ from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, pe
 # Units that the tools of drives write, and their values in SI.
 #
 # A value in SI is value · factor. For shares of the rated torque the factor applies to ``--rated-torque``. 1/s means a
-# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``.
+# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``. Hz of a file is no unit of
+# speed: the output frequency of an inverter is that of the stator, pole pairs times the turns of the shaft, plus slip.
 
 
 QUANTITIES = ("time", "speed", "torque")
@@ -42,22 +43,27 @@ _PERMILLE = ColumnUnit("torque", "‰", 1e-3, of_rated=True)
 # Units of traces besides `profiles.quantities`, which accepts no ambiguous unit.
 _ALSO = {
     "time": {},
-    "speed": dict.fromkeys(("1/s", "s1", "hz"), _TURNS),
+    "speed": dict.fromkeys(("1/s", "s1"), _TURNS),
     "torque": {
         "%": _PERCENT, "pct": _PERCENT, "percent": _PERCENT, "‰": _PERMILLE, "permille": _PERMILLE,
         "promille": _PERMILLE, "permil": _PERMILLE,
     },
 }
+_TOLD_ONLY = {"speed": {"hz": ColumnUnit("speed", "Hz", quantities.TURNS_S.times)}}
 _BRACKETED = re.compile(r"^(.*?)\s*[\[(<]\s*([^\[\]()<>]*?)\s*[\])>]$")
 
 
-def unit_of(quantity: str, text: str) -> ColumnUnit | None:
-    """Return the unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if it is unknown."""
+def unit_of(quantity: str, text: str, *, told: bool = False) -> ColumnUnit | None:
+    """Return the unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if it is unknown.
+
+    ``told``: the user states it, so that it may be a unit that has another meaning in a file.
+    """
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
     # case distinguishes mN·m from MN·m; it does not matter for a time, because no tool samples in megaseconds
     word = quantities.SIGNS_IGNORED.sub("", inner.replace("¹", "1").casefold())
-    if (also := _ALSO[quantity].get(word)) is not None:
+    more = _TOLD_ONLY.get(quantity, {}) if told else {}
+    if (also := _ALSO[quantity].get(word) or more.get(word)) is not None:
         return also
     known = quantities.unit_of(inner if quantity != "time" else inner.casefold())
     if known is None or known.dimension != quantity:
@@ -106,12 +112,17 @@ def odd_unit(quantity: str, name: str) -> str:
     parts = re.split(r"[_ ]", base)
     for start in range(1, len(parts)):
         ending, first = "_".join(parts[start:]), unit_of(quantity, parts[start])
-        word = quantities.SIGNS_IGNORED.sub("", ending.casefold())
-        other = word in _ODD_UNITS or quantities.unit_of(word) is not None
-        if (other and word not in _SETPOINT_WORDS and (len(word) > 1 or base.casefold().endswith("_a"))) or (
+        if (_is_any_unit(ending) and (len(ending) > 1 or base[-2] == "_")) or (
                 first is not None and len(parts[start]) > 1 and first.symbol != SI[quantity]):
             return ending
     return ""
+
+
+def _is_any_unit(text: str) -> bool:
+    """Return whether a text is a unit of any quantity. Of the letters only A is one."""
+    word = quantities.SIGNS_IGNORED.sub("", text.casefold())
+    return word in _ODD_UNITS or (
+        len(word) > 1 and word not in _SETPOINT_WORDS and quantities.unit_of(word) is not None)
 
 
 # Words in names of columns that are not the actual value, in English and German. `reference` is a setpoint in the trace
@@ -149,7 +160,8 @@ def is_setpoint(quantity: str, name: str, *, sensor: bool = False) -> bool:
 def known_units(quantity: str) -> tuple[str, ...]:
     """Return the symbols that a message offers."""
     plain = {"time": quantities.TIME, "speed": quantities.SPEED, "torque": quantities.TORQUE}[quantity]
-    return tuple(dict.fromkeys((*quantities.known(plain), *(unit.symbol for unit in _ALSO[quantity].values()))))
+    more = (*_ALSO[quantity].values(), *_TOLD_ONLY.get(quantity, {}).values())
+    return tuple(dict.fromkeys((*quantities.known(plain), *(unit.symbol for unit in more))))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -197,7 +209,7 @@ def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, 
         if quantity in found:
             raise UsageError(f"{quantity} is named twice", where=flag, entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         column, colon, spelt = name.strip().rpartition(":")
-        unit = unit_of(quantity, spelt)
+        unit = unit_of(quantity, spelt, told=True)
         if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a complete name
             found[quantity] = ColumnChoice(quantity, name.strip())
         elif column and unit is not None:
@@ -415,8 +427,8 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
 
 
 def _states_units(quantities: Sequence[str], row: Sequence[str]) -> bool:
-    """Return whether a row below the header is a row of units: one is known, or all are in brackets."""
-    return any(map(unit_of, quantities, row)) or all(
+    """Return whether a row below the header is a row of units: one is a unit, or all are in brackets."""
+    return any(map(unit_of, quantities, row)) or any(_is_any_unit(cell.strip("[](){}<> ")) for cell in row) or all(
         (found := _BRACKETED.match(cell.strip())) is not None and not found.group(1) for cell in row)
 
 
@@ -449,6 +461,8 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
              "as told"] if is_setpoint(quantity, name, sensor=flag == REFERENCE_FLAG) else []
     if choice.unit is not None:
         other = below or named
+        if choice.unit.symbol == "Hz":
+            notes.append(f"{shown(name)!r} in Hz was read as revolutions of the shaft a second, as told")
         if other is not None and other != choice.unit:
             notes.append(f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}")
         return choice.unit, notes
@@ -460,6 +474,11 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
         if quantity == "torque" and odd.casefold() in _CURRENTS:
             what += "a unit of current. A current is not a torque"
             first += " with the torque constant of the motor"
+        elif quantity == "speed" and odd.casefold() == "hz":
+            what += ("a frequency. The output frequency of an inverter is that of the stator: the pole pairs times the "
+                     "turns of the shaft a second, plus slip")
+            raise CsvMisnamed(what, where=where, next_step="Export the actual speed of the motor, such as in rpm. If "
+                              f"the column is the turns of the shaft a second, state Hz {next_step[:-2]}Hz'")
         else:
             what += f"not a unit of {quantity}; use {', '.join(known_units(quantity))}"
         raise CsvMisnamed(what, where=where,
