@@ -61,12 +61,14 @@ EXPORTS = {
         "time_s,speed_rad_s,I_A\n0,1,2\n1,2,3\n", "utf-8", ("torque=I_A:Nm",), None, [0, 1], [1, 2], [2, 3], ()),
     "speed in 1/min, not the least speed": ("time_s,speed_1/min,torque_nm\n0,60,2\n1,61,3\n", "utf-8", (), None,
                                             [0, 1], [60 * RPM, 61 * RPM], [2, 3], ()),
+    "seconds that are told": ("t,w_rad_s,m_nm\n0,1,2\n1,2,3\n", "utf-8", ("time=t:s", "speed=w_rad_s", "torque=m_nm"),
+                              None, [0, 1], [1, 2], [2, 3], ()),
     "feet and turns": ("a;b;c\nmin;1/s;lbf·ft\n0;1;1\n1;2;-2\n", "utf-8", ("time=a", "speed=b", "torque=c"), None,
                        [0, 60], [2 * math.pi, 4 * math.pi], [FOOT_POUND, -2 * FOOT_POUND], ("revolutions a second",)),
     "Hz, told to be turns": ("time_s;freq_hz;torque_nm\n0;1;1\n1;2;-2\n", "utf-8", ("speed=freq_hz:Hz",), None,
                              [0, 1], [2 * math.pi, 4 * math.pi], [1, -2], ("revolutions of the shaft a second",)),
-    "units that nobody states": ("t,w,m\n0,1,2\n1,2,3\n", "utf-8", ("time=t", "speed=w", "torque=m"), None,
-                                 [0, 1], [1, 2], [2, 3], ("s was assumed", "rad/s was assumed", "N·m was assumed")),
+    "units that nobody states": ("t,w,m\n0,1,2\n0.5,2,3\n", "utf-8", ("time=t", "speed=w", "torque=m"), None,
+                                 [0, 0.5], [1, 2], [2, 3], ("s was assumed", "rad/s was assumed", "N·m was assumed")),
     "told otherwise than the file says": (
         "time_s,n_rpm,torque_nm\n0,1,2\n1,2,3\n", "utf-8", ("speed=n_rpm:rad/s",), None,
         [0, 1], [1, 2], [2, 3], ("the file says rpm",)),
@@ -154,6 +156,10 @@ REFUSED = {
        for text in ("t;n [Hz];m\n0;1;2\n", "t;n;m\ns;Hz;Nm\n0;1;2\n", "t;n;m\n;Hz;\n0;1;2\n")},
     "Hz in the name": ("time_s,speed_hz,torque_nm\n0,1,2\n", ("speed=speed_hz",), 2,
                        "state Hz behind a colon: --columns speed='speed_hz:Hz'"),
+    **{f"a time without a unit: {name}": (
+        "time,speed_rad_s,torque_nm\n" + "".join(f"{step * n},1,2\n" for n in range(9)), (), 2,
+        f"usual step is {step}. It may count milliseconds or samples. State its unit: --columns time='time:ms'")
+       for name, step in (("samples", 1), ("ms", 4), ("µs", 250))},
     "units at odds": ("time_s,n_rpm,torque_nm\ns,rad/s,Nm\n0,1,2\n", ("speed=n_rpm",), 2, "rpm by its name but rad/s"),
     "per cent of nothing": ("time_s,speed_rad_s,torque_pct\n0,1,2\n", (), 2, "--rated-torque"),
     "decimal commas between commas": (HEAD + "0,0,1,5,2,5\n" * 50, (), 10, "decimal commas the separator must be"),

@@ -7,7 +7,7 @@ A unit is taken from ``--columns``, else from a row of units below the header, e
 import difflib
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 from profiles import quantities
@@ -18,8 +18,9 @@ from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, pe
 # Units that the tools of drives write, and their values in SI.
 #
 # A value in SI is value · factor. For shares of the rated torque the factor applies to ``--rated-torque``. 1/s means a
-# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``. Hz of a file is no unit of
-# speed: the output frequency of an inverter is that of the stator, pole pairs times the turns of the shaft, plus slip.
+# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``. Hz of a file is no unit
+# of speed: the output frequency of an inverter is that of the stator, pole pairs times the turns of the shaft, plus
+# slip.
 
 
 QUANTITIES = ("time", "speed", "torque")
@@ -28,12 +29,15 @@ SI = {"time": "s", "speed": "rad/s", "torque": "N·m"}
 
 @dataclass(frozen=True)
 class ColumnUnit:
-    """Unit of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque."""
+    """Unit of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque; ``assumed``: it
+    is not stated.
+    """
 
     quantity: str
     symbol: str
     factor: float
     of_rated: bool = False
+    assumed: bool = False
 
 
 _TURNS = ColumnUnit("speed", "1/s", quantities.TURNS_S.times)
@@ -256,7 +260,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     """
     best: tuple[tuple[int, int, int], int, list[str]] | None = None
     usual = ",".join(_STANDARD[choice.quantity] for choice in choices)
-    sensor = _flag(choices) == REFERENCE_FLAG
+    sensor = columns_flag(choices) == REFERENCE_FLAG
     for number, line in enumerate(lines[:HEADER_LINES], 1):
         for delimiter in DELIMITERS:
             if delimiter not in line:
@@ -318,16 +322,16 @@ def _one_each(
             several = ", ".join(repr(shown(names[at])) for at in positions[:4])
             raise CsvMisnamed(
                 f"{len(positions)} columns could be {choice.quantity}: {several}", where=where,
-                next_step=f"Name one with {_flag(choices)}, and rename it in the file if the names are the same",
+                next_step=f"Name one with {columns_flag(choices)}, and rename it in the file if the names are the same",
             )
     chosen = tuple(positions[0] for positions in found)
     if len(set(chosen)) < len(chosen):
         raise CsvMisnamed("one column would hold two quantities", where=where,
-                          next_step=f"Name all with {_flag(choices)}")
+                          next_step=f"Name all with {columns_flag(choices)}")
     return chosen
 
 
-def _flag(choices: Choices) -> str:
+def columns_flag(choices: Choices) -> str:
     """Return the option that names these columns: `--column` for a reference without a speed, else `--columns`."""
     return _WHERE if len(choices) == len(QUANTITIES) else REFERENCE_FLAG
 
@@ -336,7 +340,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
     there = [name for name in names if name]
     listed = ", ".join(shown(name) for name in there[:12]) + (", …" if len(there) > 12 else "")
     wanted = choice.name or choice.quantity
-    sensor = _flag(choices) == REFERENCE_FLAG
+    sensor = columns_flag(choices) == REFERENCE_FLAG
     others = [] if choice.name else [name for name in there if choice.quantity in name.casefold()
                                      and is_setpoint(choice.quantity, name, sensor=sensor)]
     if others:
@@ -344,7 +348,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
         return CsvMisnamed(
             f"no column holds the actual {choice.quantity}. By name, {several} {'is' if len(others) == 1 else 'are'} a "
             "setpoint, a limit or an error", where=where,
-            next_step=f"Name the column of the actual {choice.quantity}: {_flag(choices)} {choice.quantity}=…. "
+            next_step=f"Name the column of the actual {choice.quantity}: {columns_flag(choices)} {choice.quantity}=…. "
             f"The columns are: {listed}. A setpoint is read only if it is named here",
         )
     folded = {_folded(form): name for name in there for form in (split_name(name)[0], name)}
@@ -353,7 +357,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
     missing = f"no column {shown(wanted)!r}" if choice.name else f"no column is called {choice.quantity}"
     step = f"The columns are: {listed}"
     if not choice.name:
-        step += f". Say which is which: {_flag(choices)} {' '.join(f'{one.quantity}=…' for one in choices)}"
+        step += f". Say which is which: {columns_flag(choices)} {' '.join(f'{one.quantity}=…' for one in choices)}"
     return CsvMisnamed(f"{missing}{hint}", where=where, next_step=step)
 
 
@@ -409,7 +413,7 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
             assumed.append(f"{file}: clock times; the first row is at 0 s")
             continue
         name = header.names[header.columns[position]]
-        unit, notes = _unit(choice, name, stated[position], where, _flag(choices))
+        unit, notes = _unit(choice, name, stated[position], where, columns_flag(choices))
         units.append(unit)
         assumed += [f"{file}: {note}" for note in notes]
     # a table with commas between its cells has no points between thousands, and a drive's trace no steps of 1 s
@@ -492,7 +496,7 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
     if unit is None:
         si = unit_of(quantity, SI[quantity])
         assert si is not None
-        return si, [*notes, f"no unit is stated for {shown(name)!r}; {SI[quantity]} was assumed"]
+        return replace(si, assumed=True), [*notes, f"no unit is stated for {shown(name)!r}; {SI[quantity]} was assumed"]
     if unit.symbol == "1/s":
         return unit, [*notes, f"{shown(name)!r} in 1/s was read as revolutions a second"]
     return unit, notes

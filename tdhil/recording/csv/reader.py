@@ -11,9 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError
+from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, shown
 from tdhil.recording.csv.excitation import load_excitation
-from tdhil.recording.csv.layout import REFERENCE_FLAG, USUAL, Choices, ColumnLayout, find_layout, named
+from tdhil.recording.csv.layout import (
+    REFERENCE_FLAG,
+    USUAL,
+    Choices,
+    ColumnLayout,
+    columns_flag,
+    find_layout,
+    named,
+)
 from tdhil.recording.csv.text import (
     LARGEST,
     ClockReader,
@@ -281,6 +289,8 @@ def _read_columns(
     if whole:
         again = np.concatenate([[False], np.all([np.diff(column) == 0.0 for column in columns], axis=0)])
         columns, lines = [column[~again] for column in columns], lines[~again]
+    if layout.units[0].assumed and len(lines) > 1:
+        _check_seconds(float(np.median(np.diff(columns[0]))), layout, choices, file)
     keep, notes = rising(columns[0], lines, file)
     if not np.all(keep):
         columns = [column[keep] for column in columns]
@@ -289,6 +299,24 @@ def _read_columns(
         raise CsvUnusable(f"a reference must be whole: {what}", where=f"{file}:{where}",
                           next_step="Correct or remove this line in a copy of the file, or export it again")
     return columns, (*warnings, *dropped, *notes)
+
+
+COARSE_S = 1.0
+"""Step of the time, s, from which a time without a unit is not taken for seconds. A choice: drives, PLCs and loggers
+sample faster, and their counts of samples and of milliseconds have steps of 1 and more."""
+
+
+def _check_seconds(step: float, layout: ColumnLayout, choices: Choices, file: str) -> None:
+    """Raise CsvMisnamed for a time without a unit whose usual step is too large for seconds."""
+    if step < COARSE_S:
+        return
+    name, flag = shown(layout.header.names[layout.header.columns[0]]), columns_flag(choices)
+    raise CsvMisnamed(
+        f"no unit is stated for {name!r}, whose usual step is {step:g}. It may count milliseconds or samples",
+        where=f"{file}:{layout.header.line}",
+        next_step=f"State its unit: {flag} time='{name}:ms', or ':s' if it is in seconds. If it counts samples, divide "
+        "it by the sample rate in a copy of the file",
+    )
 
 
 def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> list[float]:
