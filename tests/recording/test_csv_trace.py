@@ -87,7 +87,8 @@ EXPORTS = {
     "a time twice, one too high, one back, a gap": (
         "time_s,speed_rad_s,torque_nm\n" + "".join(
             f"{t},{t},1\n" for t in [*range(12), 11, 12, 13, 99, 14, 3, *range(15, 40), 60, 61]), "utf-8", (), None,
-        [*range(40), 60, 61], [*range(40), 60, 61], [1] * 42, ("3 rows were dropped, where the time", "1 gap")),
+        [*range(40), 60, 61], [*range(40), 60, 61], [1] * 42,
+        ("3 rows were dropped, where the time repeats itself", "1 gap")),
     "a channel that starts late": (
         "time_s,speed_rad_s,torque_nm\n" + "".join(f"{n},,\n" for n in range(9)) + "9,1,2\n10,2,3\n", "utf-8", (), None,
         [9, 10], [1, 2], [2, 3], ("2: 9 rows were dropped: no value",)),
@@ -233,6 +234,33 @@ def test_files_rows_and_lines_have_a_limit(tmp_path, monkeypatch):
     path.write_text(HEAD + ROWS + "1," * csv_text.MAX_LINE)
     with pytest.raises(CsvUnusable, match=r"trace.csv:102: a line of more than 65536"):
         read_trace(path)
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 1000.0])
+@settings(max_examples=15, deadline=None)
+@given(at=st.integers(200, 1700), back=st.integers(2, 150))
+def test_a_clock_that_is_set_back_leaves_a_gap(tmp_path_factory, rate_hz, at, back):
+    """Time, speed and torque are one on both sides of the gap, and no row of the wrong time is beside a right one."""
+    number = np.arange(2000)
+    stamps = (number - np.where(number < at, 0, back)) / rate_hz
+    path = tmp_path_factory.getbasetemp() / "clock.csv"
+    path.write_text(HEAD + "".join(f"{t:.4f},{n},1\n" for t, n in zip(stamps, number, strict=True)))
+    trace = read_trace(path)
+    said, gap = trace.warnings
+    assert f":{at + 2}: " in said
+    assert f"where the time goes back by {(back - 1) / rate_hz:.3g} s; a gap was left" in said
+    assert "1 gap in the time" in gap
+    steps = np.diff(trace.time_s)
+    (seam,) = np.flatnonzero(np.diff(trace.speed_rad_s) > 1.0)
+    assert steps[seam] >= max(0.1, 5.0 / rate_hz)
+    assert trace.speed_rad_s[seam] == at - 1 and np.all(np.delete(steps, seam) < 1.5 / rate_hz)
+
+
+def test_a_single_time_out_of_order_leaves_no_gap(tmp_path):
+    path = tmp_path / "trace.csv"
+    path.write_text(HEAD + "".join(f"{n if n != 40 else 7},{n},1\n" for n in range(100)))
+    (said,) = read_trace(path).warnings
+    assert said.endswith("1 row was dropped, where the time goes back by 32 s")
 
 
 @pytest.mark.parametrize("odd", ["", "200.5,NaN,1", "200.5,x,1", "200.5", '"200.5","1","2"'])

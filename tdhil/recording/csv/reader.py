@@ -153,6 +153,7 @@ class RowReader:
 LONGEST_S = 7 * 86400.0
 _MOST_DROPPED = 0.10      # largest share of rows dropped; with more it is not one recording
 GAP_INTERVALS = 5.0       # usual intervals, from which a gap is reported
+LEAST_GAP_S = 0.1         # shortest gap that is left where a clock was set back. A choice: estimation bridges 0.05 s
 
 
 def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, list[str]]:
@@ -169,15 +170,18 @@ def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, 
     warnings = []
     if len(lost):
         first = int(lost[0])
-        same = float(np.mean(np.isin(time_s[lost], time_s[keep]))) if len(lost) < 100_000 else _same(time_s)
-        how = "repeats itself" if same > 0.5 else "goes back"
+        step = float(time_s[first] - time_s[first - 1])
+        how = "repeats itself" if step == 0.0 else "goes back" if step < 0.0 else "jumps ahead and back"
         if len(lost) > _MOST_DROPPED * len(time_s):
             raise CsvUnusable(
                 f"the time {how}, here and in {len(lost) - 1} more of {len(time_s)} rows",
                 where=f"{file}:{lines[first]}",
                 next_step="Export one recording, in its order, with time stamps as fine as the samples",
             )
-        warnings.append(f"{file}:{lines[first]}: {_row_list(len(lost))} dropped, where the time {how}")
+        apart = _kept_apart(time_s, keep)
+        by = f" by {-step:.3g} s" if step < 0.0 else ""
+        warnings.append(f"{file}:{lines[first]}: {_row_list(int(np.sum(~keep)))} dropped, where the time {how}{by}"
+                        + ("; a gap was left there, because the clock was set back" if apart else ""))
     steps = np.diff(time_s[keep])
     if not len(steps):
         return keep, warnings
@@ -195,9 +199,20 @@ def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, 
     return keep, warnings
 
 
-def _same(time_s: FloatArray) -> float:
-    falls = np.diff(time_s)
-    return float(np.mean(falls[falls <= 0.0] == 0.0)) if np.any(falls <= 0.0) else 0.0
+def _kept_apart(time_s: FloatArray, keep: BoolArray) -> bool:
+    """Leave out further rows in ``keep``, so that a gap remains where the clock was set back; return whether it was.
+
+    The rows after such a place continue from the earlier time. Those behind the highest time so far are later than
+    their stamps say, and the motion between both parts is not known. A single stamp out of order is no such place.
+    """
+    lost = ~keep
+    begins = 1 + np.flatnonzero(lost[1:-1] & lost[2:] & (time_s[1:-1] < time_s[:-2]) & (time_s[2:] > time_s[1:-1]))
+    kept = np.flatnonzero(keep)
+    highest = time_s[kept][np.searchsorted(kept, begins) - 1]
+    gap_s = max(LEAST_GAP_S, (GAP_INTERVALS + 1.0) * float(np.median(np.diff(time_s[kept])))) if len(kept) > 1 else 0.0
+    for first, last in np.searchsorted(time_s[kept], np.stack([highest, highest + gap_s], axis=1), side="right"):
+        keep[kept[first:last]] = False
+    return len(begins) > 0
 
 
 def _row_list(count: int) -> str:
