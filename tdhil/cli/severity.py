@@ -85,6 +85,7 @@ def run(namespace: argparse.Namespace) -> int:
         warnings += remarks
         with working("computing the downhole speed …"):
             found.append((severity(record, string, inertia, expected if path == paths[-1] else None), str(path)))
+            warnings += [f"{path.name}: {one}" for one in found[-1][0].left_out]
             try:
                 noises.append(bit_noise_in(record, string, inertia))
             except SeverityRefused as refused:     # a text states why the record does not determine the bit noise

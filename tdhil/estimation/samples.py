@@ -13,7 +13,7 @@ LONGEST_LAG_S = 0.5
 """Longest plausible time constant of a reported speed or torque, s."""
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Feedback that is frozen although it is marked as fresh: the same value repeats while the motion must change it.
+# Feedback that is frozen without a mark of it: the same value repeats while the motion must change it.
 #
 # A smooth wave rounded to q rests on one value about its crests: x ≈ A − A ω² t²/2 stays within q for 2 √(2q/A)/ω. A
 # run of equal values is frozen if it is several times as long as that at the slowest line, and longer than a gap that a
@@ -196,10 +196,15 @@ def left_out_warnings(recording: Recording) -> tuple[str, ...]:
             MessageCode.SAMPLES_LEFT_OUT))
     stuck = frozen(recording)
     if stuck is not None:
-        where, share = float(recording.time_s[np.argmax(stuck)]), float(np.mean(stuck))
+        first = int(np.argmax(stuck))
+        last = first + int(np.argmin(np.append(stuck[first:], False)))
+        run = first - 1 + np.flatnonzero(recording.fresh[first - 1 : last])
+        at, length = float(recording.time_s[first]), float(np.ptp(recording.time_s[run]))
+        names = [name for name, signal in (("speed", recording.speed_rad_s), ("torque", recording.torque_nm))
+                 if len(np.unique(signal[run])) == 1]
         said.append(CodedText(
-            f"the feedback did not change although it was marked as fresh, first at {where:.6g} s. tdhil left out "
-            f"{100 * share:.1f} % of the samples",
+            f"the reported {' and '.join(names or ['speed or torque'])} did not change for {length:.3g} s, first at "
+            f"{at:.6g} s. tdhil left out {100.0 * float(np.mean(stuck)):.1f} % of the samples",
             MessageCode.SAMPLES_LEFT_OUT,
         ))
     return tuple(said)

@@ -6,25 +6,23 @@ from profiles import lazy_names
 
 if TYPE_CHECKING:
     from tdhil.soft_torque.drill_string import (
-        BitFriction as BitFriction, EXACT_STRING as EXACT_STRING,
-        BottomEnd as BottomEnd, DrillString as DrillString, WaveLine as WaveLine,
-        PipeSection as PipeSection,
-        StringFile as StringFile, identified_string as identified_string, StringTolerance as StringTolerance,
-        ToleranceFile as ToleranceFile, line_of as line_of, load_string as load_string,
-        spring_and_mass as spring_and_mass, string_of as string_of,
+        BitFriction as BitFriction, EXACT_STRING as EXACT_STRING, BottomEnd as BottomEnd, DrillString as DrillString,
+        WaveLine as WaveLine, PipeSection as PipeSection, StringFile as StringFile,
+        identified_string as identified_string, StringTolerance as StringTolerance, ToleranceFile as ToleranceFile,
+        line_of as line_of, load_string as load_string, spring_and_mass as spring_and_mass, string_of as string_of,
     )
     from tdhil.soft_torque.controller import (
         ClosedSystem as ClosedSystem, DERIVATIVE_FILTER_S as DERIVATIVE_FILTER_S, Margins as Margins,
-        NaturalMode as NaturalMode,
-        SpeedController as SpeedController, TopDrive as TopDrive, control_law as control_law, impedance as impedance,
-        inner_lags as inner_lags, margins as margins, reflection as reflection, reflection_at as reflection_at,
-        softest_allowed as softest_allowed, stiff_controller as stiff_controller, tuned_controller as tuned_controller,
+        NaturalMode as NaturalMode, SpeedController as SpeedController, TopDrive as TopDrive,
+        control_law as control_law, impedance as impedance, inner_lags as inner_lags, margins as margins,
+        reflection as reflection, reflection_at as reflection_at, softest_allowed as softest_allowed,
+        stiff_controller as stiff_controller, tuned_controller as tuned_controller,
     )
     from tdhil.soft_torque.evaluation import (
         Evaluation as Evaluation, EvaluationCase as EvaluationCase, EvaluationRefused as EvaluationRefused,
         EvaluationOutcome as EvaluationOutcome, Prediction as Prediction, Trial as Trial, RigWindow as RigWindow,
-        case_of as case_of,
-        evaluate as evaluate, program_for as program_for, check_virtual_string as check_virtual_string,
+        case_of as case_of, evaluate as evaluate, program_for as program_for,
+        check_virtual_string as check_virtual_string,
     )
     from tdhil.soft_torque.own_units import (
         DriveSetting as DriveSetting, drive_settings as drive_settings, notch_settings as notch_settings,
@@ -37,8 +35,7 @@ if TYPE_CHECKING:
     )
     from tdhil.soft_torque.uncertainty import (
         Interval as Interval, DrawnValues as DrawnValues, Truth as Truth, draw_truths as draw_truths,
-        independent_axes as independent_axes,
-        joint_draws as joint_draws,
+        independent_axes as independent_axes, joint_draws as joint_draws,
     )
     from tdhil.soft_torque.simulation import (
         Begin as Begin, Grid as Grid, RPM as RPM, SimulationTrace as SimulationTrace, bit_jumps as bit_jumps,
@@ -64,10 +61,9 @@ if TYPE_CHECKING:
     )
     from tdhil.soft_torque.speed_torque_map import OperatorMap as OperatorMap, operator_map as operator_map
     from tdhil.soft_torque.torsional_severity import (
-        AT_RISK_INDEX as AT_RISK_INDEX, ReflectionCheck as ReflectionCheck,
-        SeverityCourse as SeverityCourse, StickSlipEpisode as StickSlipEpisode,
-        STICK_SLIP_INDEX as STICK_SLIP_INDEX, Severity as Severity, SeverityRefused as SeverityRefused,
-        SurfaceRecord as SurfaceRecord, severity as severity,
+        AT_RISK_INDEX as AT_RISK_INDEX, ReflectionCheck as ReflectionCheck, SeverityCourse as SeverityCourse,
+        StickSlipEpisode as StickSlipEpisode, STICK_SLIP_INDEX as STICK_SLIP_INDEX, Severity as Severity,
+        SeverityRefused as SeverityRefused, SurfaceRecord as SurfaceRecord, severity as severity,
     )
     from tdhil.soft_torque.bit_noise import (
         BitNoiseEstimate as BitNoiseEstimate, bit_noise_in as bit_noise_in, with_noise as with_noise,

@@ -304,7 +304,6 @@ def _bit_ends(string: DrillString) -> list[tuple[DrillString, DrillString]]:
     """Return the string at both ends of the tolerances of its bottom's inertia, drag and bit."""
     tolerance, bit = string.tolerance, string.bit
     share, factor = tolerance.bottom_inertia, tolerance.drag_factor
-
     factors = ((StringFactors(bottom=1.0 - share), StringFactors(bottom=1.0 + share)),
                (StringFactors(drag=1.0 / factor), StringFactors(drag=factor)))
     pairs = [(low.applied_to(string), high.applied_to(string)) for low, high in factors]

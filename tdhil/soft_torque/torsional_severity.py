@@ -50,6 +50,9 @@ GAP_PERIODS = 0.1
 """Longest gap within a gapless part of the record, in periods of the lowest mode."""
 LEAST_PERIODS = 3.0
 """Least length of a gapless part that is used, in periods of the lowest mode."""
+HELD_TIMES, LEAST_FROZEN, RESTS, SWING_PARTS = 5.0, 8, 3.0, 16
+"""Least length of a frozen signal: times that of the usual values (90 of 100 last no longer), samples, and rests of a
+rounded crest. Number of means in a period from which the motion beside it is found."""
 PART_S = 0.3
 """Longest travel time, s, between two places of a line at which the mud's drag is lumped."""
 TURNING_SHARE = 0.5
@@ -77,16 +80,10 @@ REFLECTION_TOLERANCE = 0.1
 """Largest distance of the expected |r| from the measured interval. It accounts for lags that are not known exactly."""
 
 
-NOT_IDENTIFIABLE = 9
-"""Exit code: the record does not determine the requested quantity."""
-
-
 class SeverityRefused(TdhilError):
     """Refusal: the record does not determine the torsional motion of the string. The message gives the reason."""
 
-    entry = MessageCode.SEVERITY_REFUSED
-
-    exit_code = NOT_IDENTIFIABLE
+    entry, exit_code = MessageCode.SEVERITY_REFUSED, 9      # not identifiable
 
 
 @dataclass(frozen=True)
@@ -177,6 +174,8 @@ class Severity:
     reflection: ReflectionCheck | None
     reflection_refused: str
     course: SeverityCourse
+    left_out: tuple[str, ...] = ()
+    """Sentences on the time in which a signal was frozen. It was left out."""
 
     @property
     def level(self) -> str:
@@ -217,7 +216,14 @@ def severity(
     ``expected``: top drive and controller that should be active, for the check of the reflection.
     """
     period = 1.0 / string_modes_hz(string)[0]
+    record, left_out = _measured(record, period)
     stretches = _stretches(record, period)
+    speed, pulls = (np.concatenate([getattr(one, name) for one in stretches]) for name in ("speed", "torque"))
+    mean, pull = float(speed.mean()), float(pulls.mean())
+    if mean * pull < 0.0 and abs(mean) > LEAST_SPEED_RAD_S:
+        raise SeverityRefused(
+            f"the mean torque is {pull:.4g} N·m and the mean speed {mean:.4g} rad/s: the top drive would brake",
+            next_step="One of them has the wrong sign. Correct it in a copy of the record")
     step = float(stretches[0].time_s[1] - stretches[0].time_s[0])
     found = [_windows(one, string, inertia.value, period, step) for one in stretches]
     used = np.concatenate([one.used for one in found])
@@ -228,10 +234,9 @@ def severity(
     index = np.concatenate([one.index for one in found])
     chosen = stuck if stuck.any() else used
 
-    def medians(cases: Sequence[_Windows]) -> tuple[float, float, float]:
-        rows = [np.concatenate([getattr(one, name) for one in cases])[chosen]
+    def medians(cases: Sequence[_Windows]) -> list[float]:
+        return [float(np.nanmedian(np.concatenate([getattr(one, name) for one in cases])[chosen]))
                 for name in ("index", "swing", "torque_swing")]
-        return float(np.nanmedian(rows[0])), float(np.nanmedian(rows[1])), float(np.nanmedian(rows[2]))
 
     value = medians(found)
     by_inertia = [medians([_windows(one, string, end, period, step) for one in stretches])
@@ -245,7 +250,6 @@ def severity(
                             max(value[at], *(one[at] for one in by_inertia))),
                    [[one[at] for one in pair] for pair in (by_scale + by_string if at < 2 else by_scale)])
         for at in range(3))
-    speed = np.concatenate([one.speed for one in stretches])
     times = np.concatenate([one.time_s for one in stretches])
     cycles = np.concatenate([_cycles(one, windows, bool(stuck.any()), period)
                              for one, windows in zip(stretches, found, strict=True)])
@@ -259,7 +263,7 @@ def severity(
         at_risk_share=float(np.mean(index[used] >= AT_RISK_INDEX)), episodes=_episodes(times, index, stuck, step),
         period_s=period_found, cycles=len(cycles), downhole_rad_s=swing, torque_nm=torque, window_s=period,
         reflection=check, reflection_refused=refused,
-        course=_course(stretches, found, inertia.value))
+        course=_course(stretches, found, inertia.value), left_out=left_out)
 
 
 def turning_spans(
@@ -271,7 +275,7 @@ def turning_spans(
     """
     period = 1.0 / string_modes_hz(string)[0]
     spans = []
-    for stretch in _stretches(record, period):
+    for stretch in _stretches(_measured(record, period)[0], period):
         step = float(stretch.time_s[1] - stretch.time_s[0])
         found = _windows(stretch, string, inertia_kg_m2, period, step)
         high = found.used & (np.nan_to_num(found.index) >= STICK_SLIP_INDEX)
@@ -283,7 +287,53 @@ def turning_spans(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The record on one grid.
+# The record without frozen signals, on one grid.
+
+
+def _measured(record: SurfaceRecord, period_s: float) -> tuple[SurfaceRecord, tuple[str, ...]]:
+    """Return the record without the time in which a signal is frozen, and a sentence for each such signal."""
+    good, said, time = np.ones(len(record.time_s), dtype=np.bool_), [], record.time_s
+    for name, signal in (("torque", record.torque_nm), ("speed", record.speed_rad_s)):
+        runs = _frozen(time, signal, period_s) if len(time) else []
+        for first, last in runs:
+            good[first + 1:last] = False
+        if runs:
+            said.append(f"The reported {name} did not change for {sum(time[b - 1] - time[a] for a, b in runs):.3g} s, "
+                        f"first at {time[runs[0][0]]:.6g} s. This time was left out.")
+    return replace(record, time_s=time[good], speed_rad_s=record.speed_rad_s[good],
+                   torque_nm=record.torque_nm[good]), tuple(said)
+
+
+def _frozen(time: Array, signal: Array, period_s: float) -> list[tuple[int, int]]:
+    """Return the runs [first, last) of equal values that last too long for a signal that is held or rounded.
+
+    Such a run is longer than a gap that is bridged, than the usual values by `HELD_TIMES`, and than `RESTS` times the
+    rest of an oscillation of amplitude A, rounded to q, about its crest: √(2q/A)/π periods. A is the least of both
+    sides, each the median of three periods beside the run. Below 2 q, a signal may rest for any time.
+    """
+    values = np.unique(signal)
+    steps = np.diff(values)[np.diff(values) > 1e-9 * np.abs(values[1:])]
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(signal)) + 1, [len(signal)]])
+    area = np.concatenate([[0.0], np.cumsum(0.5 * (signal[1:] + signal[:-1]) * np.diff(time))])
+    lasting = time[edges[1:] - 1] - time[edges[:-1]]
+    least_s = max(GAP_PERIODS * period_s, HELD_TIMES * float(np.quantile(lasting, 0.9)))
+    found, quantum = [], float(steps.min(initial=inf))
+    for at in np.flatnonzero((lasting > least_s) & (np.diff(edges) >= LEAST_FROZEN)):
+        first, last = int(edges[at]), int(edges[at + 1])
+        swings = _swing(time, area, time[first], -period_s), _swing(time, area, time[last - 1], period_s)
+        amplitude = min((one for one in swings if one is not None), default=0.0)
+        if amplitude > 2.0 * quantum and lasting[at] > RESTS * sqrt(2.0 * quantum / amplitude) / pi * period_s:
+            found.append((first, last))
+    return found
+
+
+def _swing(time: Array, area: Array, begin_s: float, length_s: float) -> float | None:
+    """Return the amplitude to and fro, 0 for a ramp, as the median of up to three spans; ``area``: ∫ signal dt."""
+    at = begin_s + length_s * np.arange(3 * SWING_PARTS + 1) / SWING_PARTS
+    means = (np.diff(np.interp(at, time, area)) / (length_s / SWING_PARTS)).reshape(3, SWING_PARTS)
+    swings = 0.25 * (np.abs(np.diff(means)).sum(axis=1) - np.abs(means[:, -1] - means[:, 0]))
+    inside = (at[SWING_PARTS::SWING_PARTS] >= time[0]) & (at[SWING_PARTS::SWING_PARTS] <= time[-1])
+    return float(np.median(swings[inside])) if inside.any() else None
 
 
 def _stretches(record: SurfaceRecord, period_s: float) -> list[_GaplessPart]:
@@ -378,12 +428,11 @@ def _windows(stretch: _GaplessPart, string: DrillString, inertia: float, period_
     bit = downhole_speed(stretch.speed, torque, step, string)
     size = max(3, round(period_s / step))
     known = np.isfinite(bit)
-    filled = np.where(known, bit, 0.0)
     high, low = maximum_filter1d(np.where(known, bit, -inf), size), minimum_filter1d(np.where(known, bit, inf), size)
     mean = uniform_filter1d(stretch.speed, size)
     slowest = minimum_filter1d(stretch.speed, size)
     whole = uniform_filter1d(known.astype(float), size) > 0.999
-    used = whole & (mean > LEAST_SPEED_RAD_S) & (slowest > TURNING_SHARE * mean) & np.isfinite(filled)
+    used = whole & (mean > LEAST_SPEED_RAD_S) & (slowest > TURNING_SHARE * mean)
     swing = np.where(used, 0.5 * (high - low), np.nan)
     index = np.where(used, swing / np.where(used, mean, 1.0), np.nan)
     stuck = used & (np.nan_to_num(index) >= STICK_SLIP_INDEX) & (low <= STOPPED_SHARE * mean)
@@ -394,7 +443,6 @@ def _windows(stretch: _GaplessPart, string: DrillString, inertia: float, period_
 def string_ends(string: DrillString) -> list[tuple[DrillString, DrillString]]:
     """Return the string at both ends of each tolerance on which the downhole speed depends."""
     tolerance = string.tolerance
-
     factors = (
         [StringFactors(length=1.0 + sign * tolerance.length) for sign in (-1.0, 1.0)],
         [StringFactors(shear=one) for one in tolerance.shear],
@@ -417,8 +465,8 @@ def _cycles(stretch: _GaplessPart, windows: _Windows, in_stick_slip: bool, perio
     step = float(stretch.time_s[1] - stretch.time_s[0])
     where = windows.stuck if in_stick_slip else windows.used
     size = round(3.0 * period_s / step)
-    bit = np.where(np.isfinite(windows.bit), windows.bit, np.nan)
-    filled = np.where(np.isfinite(bit), bit, np.nanmean(bit) if np.isfinite(bit).any() else 0.0)
+    known, bit = np.isfinite(windows.bit), windows.bit
+    filled = np.where(known, bit, bit[known].mean() if known.any() else 0.0)
     off = filled - uniform_filter1d(filled, size)
     band = HYSTERESIS * np.nan_to_num(windows.swing, nan=inf)
     side = np.where(off > band, 1, np.where(off < -band, -1, 0))

@@ -152,6 +152,16 @@ def test_the_reflection_of_the_record_is_compared_with_that_of_the_gains(bench, 
     assert code == 2 and "no soft controller" in err
 
 
+def test_a_frozen_signal_is_left_out_with_a_warning(bench, capsys):
+    rows = np.loadtxt(bench / "before.csv", delimiter=",", skiprows=1)
+    rows[3000:, 2] = rows[3000, 2]
+    np.savetxt(bench / "before.csv", rows, delimiter=",", header="time_s,speed_rad_s,torque_nm", comments="")
+    code, out, _ = ran(bench, capsys, "--json")
+    assert code == 0
+    (said,) = (one for one in json.loads(out)["warnings"] if "did not change" in one)
+    assert said.startswith("before.csv: The reported torque did not change for 150 s, first at 150 s.")
+
+
 def test_a_record_at_standstill_is_refused(bench, capsys):
     still = np.column_stack([0.05 * np.arange(3000), np.zeros(3000), np.full(3000, 5.0)])
     np.savetxt(bench / "before.csv", still, delimiter=",", header="time_s,speed_rad_s,torque_nm", comments="")

@@ -9,7 +9,7 @@ from tdhil.estimation import Options, identify
 from tdhil.estimation.data_checks import flat_share
 from tdhil.estimation.excitation_checks import undeclared_warning, wrong_period
 from tdhil.estimation.friction_levels import warming_of
-from tdhil.estimation.samples import frozen, spikes, stretches, usable_samples
+from tdhil.estimation.samples import frozen, left_out_warnings, spikes, stretches, usable_samples
 from tdhil.estimation.spectrum import PeriodInstants, period_lines, repeating_rounding
 from tdhil.estimation.time_domain.identify import cut_off
 from tests.estimation.analytic import closed_form
@@ -102,6 +102,22 @@ def test_a_stuck_stretch_is_found_from_its_second_sample():
     speed[1000:1100], torque[1000:1100] = speed[1000], torque[1000]
     found = np.flatnonzero(frozen(replace(recording, speed_rad_s=speed, torque_nm=torque)))
     assert (found[0], found[-1], len(found)) == (1001, 1099, 99)
+
+
+@pytest.mark.parametrize("names", [("speed",), ("torque",), ("speed", "torque")])
+@pytest.mark.parametrize("marked", [False, True])
+def test_the_warning_names_the_stuck_signal_and_how_long_it_rests(names, marked):
+    recording = closed_form()
+    signals = {"speed": recording.speed_rad_s.copy(), "torque": recording.torque_nm.copy()}
+    for name in names:
+        signals[name][1000:1100] = signals[name][1000]
+    fresh = recording.fresh.copy()
+    fresh[1050:1053] = not marked           # some samples may have a mark
+    (said,) = left_out_warnings(replace(recording, speed_rad_s=signals["speed"], torque_nm=signals["torque"],
+                                        fresh=fresh))
+    length, at = np.ptp(recording.time_s[1000:1100]), recording.time_s[1001]
+    assert f"the reported {' and '.join(names)} did not change for {length:.3g} s, first at {at:.6g} s." in said
+    assert "fresh" not in said
 
 
 def test_good_samples_are_not_copied():

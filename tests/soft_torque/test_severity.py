@@ -20,7 +20,7 @@ from tdhil.soft_torque import (
     severity,
     string_of,
 )
-from tdhil.soft_torque.torsional_severity import downhole_speed
+from tdhil.soft_torque.torsional_severity import _measured, downhole_speed
 from tests.soft_torque.cases import BIT, DRIVE, FIVE_INCH, PAPER, SOFT_035, STRING, BottomEnd
 from tests.soft_torque.chain_in_time import recorded, reference_case, reported
 
@@ -128,3 +128,65 @@ def test_a_record_without_information_is_refused(drilled):
     quiet = severity(replace(record, speed_rad_s=np.full_like(record.time_s, 10.0),
                              torque_nm=np.full_like(record.time_s, 3000.0)), STRING, INERTIA)
     assert quiet.level == "smooth" and quiet.period_s is None and quiet.reflection is None
+
+
+# Speed and torque of a stiff top drive above an oscillating string, 50 samples a second, with noise of the reports.
+SECONDS = 0.02 * np.arange(9000)
+
+
+def oscillating(period_s=5.5, speed_rad_s=0.03, torque_nm=2500.0):
+    random, turn = np.random.default_rng(3), 2.0 * np.pi * SECONDS / period_s
+    return SurfaceRecord(SECONDS, 12.0 + speed_rad_s * np.cos(turn) + 0.002 * random.standard_normal(len(turn)),
+                         8000.0 + torque_nm * np.sin(turn) + 50.0 * random.standard_normal(len(turn)))
+
+
+def rounded(record: SurfaceRecord, speed_rad_s: float, torque_nm: float):
+    return replace(record, speed_rad_s=np.round(record.speed_rad_s / speed_rad_s) * speed_rad_s,
+                   torque_nm=np.round(record.torque_nm / torque_nm) * torque_nm)
+
+
+@pytest.mark.parametrize("steps", [(1e-6, 1e-3), (0.001, 10.0), (0.01, 100.0)])
+@pytest.mark.parametrize("names", [("torque_nm",), ("speed_rad_s",), ("torque_nm", "speed_rad_s")])
+def test_a_frozen_half_is_left_out_and_named(names, steps):
+    record = rounded(oscillating(), *steps)
+    whole = severity(record, EXACT, INERTIA)
+    spoilt = replace(record, **{name: np.where(SECONDS < 90.0, getattr(record, name), getattr(record, name)[4500])
+                                for name in names})
+    found = severity(spoilt, EXACT, INERTIA)
+    assert whole.left_out == () and len(found.left_out) == len(names)
+    for name, said in zip(names, found.left_out, strict=True):
+        assert f"The reported {name.split('_')[0]} did not change for 90" in said
+    assert found.turning_s < 91.0
+    assert found.index.value == pytest.approx(whole.index.value, rel=0.02)
+    assert found.period_s.value == pytest.approx(5.5, rel=0.01)
+
+
+def held(record: SurfaceRecord, count: int):
+    at = np.arange(len(SECONDS)) // count * count
+    return replace(record, speed_rad_s=record.speed_rad_s[at], torque_nm=record.torque_nm[at])
+
+
+def ramps(record: SurfaceRecord):
+    """Return a drive that reports whole revolutions a minute: constant, with ramps and an overshoot between."""
+    rpm = np.interp(SECONDS, [0, 60, 65, 66, 67, 120, 125, 180], [100, 100, 130, 135, 130, 130, 80, 80])
+    return replace(record, speed_rad_s=np.round(rpm) * RPM)
+
+
+@pytest.mark.parametrize("record", [
+    *(rounded(oscillating(), *steps) for steps in ((0.005, 500.0), (0.02, 2000.0), (0.1, 5000.0))),
+    held(oscillating(), 10), held(oscillating(), 50), rounded(held(oscillating(), 25), 0.005, 500.0),
+    ramps(oscillating()),
+    rounded(oscillating(torque_nm=0.0), 0.005, 200.0),
+    replace(oscillating(), speed_rad_s=np.full(len(SECONDS), 12.0)),
+])
+def test_a_signal_that_is_held_rounded_or_constant_is_not_frozen(record):
+    kept, said = _measured(record, 7.7)
+    assert said == () and len(kept.time_s) == len(SECONDS)
+
+
+@pytest.mark.parametrize(("speed", "torque"), [(1.0, -1.0), (-1.0, 1.0)])
+def test_a_top_drive_that_would_brake_is_refused(speed, torque):
+    record = oscillating()
+    with pytest.raises(SeverityRefused, match="the top drive would brake"):
+        severity(replace(record, speed_rad_s=speed * record.speed_rad_s, torque_nm=torque * record.torque_nm), EXACT,
+                 INERTIA)

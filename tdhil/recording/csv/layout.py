@@ -7,18 +7,20 @@ A unit is taken from ``--columns``, else from a row of units below the header, e
 import difflib
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 from profiles import quantities
 from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, shown
-from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, split_cells
+from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, perhaps_thousands, split_cells
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Units that the tools of drives write, and their values in SI.
 #
 # A value in SI is value · factor. For shares of the rated torque the factor applies to ``--rated-torque``. 1/s means a
-# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``.
+# revolution a second, as in data sheets; a tool that writes 1/s for rad/s needs ``--columns``. Hz of a file is no unit
+# of speed: the output frequency of an inverter is that of the stator, pole pairs times the turns of the shaft, plus
+# slip.
 
 
 QUANTITIES = ("time", "speed", "torque")
@@ -27,12 +29,15 @@ SI = {"time": "s", "speed": "rad/s", "torque": "N·m"}
 
 @dataclass(frozen=True)
 class ColumnUnit:
-    """Unit of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque."""
+    """Unit of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque; ``assumed``: it
+    is not stated.
+    """
 
     quantity: str
     symbol: str
     factor: float
     of_rated: bool = False
+    assumed: bool = False
 
 
 _TURNS = ColumnUnit("speed", "1/s", quantities.TURNS_S.times)
@@ -42,22 +47,27 @@ _PERMILLE = ColumnUnit("torque", "‰", 1e-3, of_rated=True)
 # Units of traces besides `profiles.quantities`, which accepts no ambiguous unit.
 _ALSO = {
     "time": {},
-    "speed": dict.fromkeys(("1/s", "s1", "hz"), _TURNS),
+    "speed": dict.fromkeys(("1/s", "s1"), _TURNS),
     "torque": {
         "%": _PERCENT, "pct": _PERCENT, "percent": _PERCENT, "‰": _PERMILLE, "permille": _PERMILLE,
         "promille": _PERMILLE, "permil": _PERMILLE,
     },
 }
+_TOLD_ONLY = {"speed": {"hz": ColumnUnit("speed", "Hz", quantities.TURNS_S.times)}}
 _BRACKETED = re.compile(r"^(.*?)\s*[\[(<]\s*([^\[\]()<>]*?)\s*[\])>]$")
 
 
-def unit_of(quantity: str, text: str) -> ColumnUnit | None:
-    """Return the unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if it is unknown."""
+def unit_of(quantity: str, text: str, *, told: bool = False) -> ColumnUnit | None:
+    """Return the unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if it is unknown.
+
+    ``told``: the user states it, so that it may be a unit that has another meaning in a file.
+    """
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
     # case distinguishes mN·m from MN·m; it does not matter for a time, because no tool samples in megaseconds
     word = quantities.SIGNS_IGNORED.sub("", inner.replace("¹", "1").casefold())
-    if (also := _ALSO[quantity].get(word)) is not None:
+    more = _TOLD_ONLY.get(quantity, {}) if told else {}
+    if (also := _ALSO[quantity].get(word) or more.get(word)) is not None:
         return also
     known = quantities.unit_of(inner if quantity != "time" else inner.casefold())
     if known is None or known.dimension != quantity:
@@ -81,6 +91,42 @@ def unit_in_name(quantity: str, name: str) -> ColumnUnit | None:
     parts = re.split(r"[_ ]", base)
     endings = ("_".join(parts[start:]) for start in range(1, len(parts)))
     return next((unit for ending in endings if (unit := unit_of(quantity, ending)) is not None), None)
+
+
+_CURRENTS = frozenset(("a", "ma", "ka", "amp", "amps", "ampere", "amperes", "arms"))
+# Units that are not of `profiles.quantities`, as they end a name: in brackets no list is needed.
+_ODD_UNITS = _CURRENTS | frozenset((
+    "pu", "kw", "volt", "volts", "mnm", "ncm", "kgm", "kgfm", "kgcm", "kgfcm", "kpm", "inlb", "inlbs", "inlbf", "lbin",
+    "lbsin", "lbfin", "ozin", "ozfin", "inoz", "krpm", "mps", "kmh", "inc", "incs", "increments", "count", "counts",
+    "cnt", "digit", "digits", "lsb", "tick", "ticks", "sample", "samples",
+))
+
+
+def odd_unit(quantity: str, name: str) -> str:
+    """Return the unit in a column's name that is none of the quantity, else ``''``: ``I_A``, ``I [A]`` → A.
+
+    A unit of the quantity before other words counts, too, because they may change it: ``torque_percent_of_limit``. A
+    letter alone is an axis or a phase, except ``_a``.
+    """
+    base, bracketed = split_name(name)
+    if bracketed:
+        return "" if unit_of(quantity, bracketed) else bracketed
+    if unit_in_name(quantity, base) is not None:
+        return ""
+    parts = re.split(r"[_ ]", base)
+    for start in range(1, len(parts)):
+        ending, first = "_".join(parts[start:]), unit_of(quantity, parts[start])
+        if (_is_any_unit(ending) and (len(ending) > 1 or base[-2] == "_")) or (
+                first is not None and len(parts[start]) > 1 and first.symbol != SI[quantity]):
+            return ending
+    return ""
+
+
+def _is_any_unit(text: str) -> bool:
+    """Return whether a text is a unit of any quantity. Of the letters only A is one."""
+    word = quantities.SIGNS_IGNORED.sub("", text.casefold())
+    return word in _ODD_UNITS or (
+        len(word) > 1 and word not in _SETPOINT_WORDS and quantities.unit_of(word) is not None)
 
 
 # Words in names of columns that are not the actual value, in English and German. `reference` is a setpoint in the trace
@@ -118,7 +164,8 @@ def is_setpoint(quantity: str, name: str, *, sensor: bool = False) -> bool:
 def known_units(quantity: str) -> tuple[str, ...]:
     """Return the symbols that a message offers."""
     plain = {"time": quantities.TIME, "speed": quantities.SPEED, "torque": quantities.TORQUE}[quantity]
-    return tuple(dict.fromkeys((*quantities.known(plain), *(unit.symbol for unit in _ALSO[quantity].values()))))
+    more = (*_ALSO[quantity].values(), *_TOLD_ONLY.get(quantity, {}).values())
+    return tuple(dict.fromkeys((*quantities.known(plain), *(unit.symbol for unit in more))))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -166,7 +213,7 @@ def parse_columns(items: Iterable[str], quantities: Sequence[str] = QUANTITIES, 
         if quantity in found:
             raise UsageError(f"{quantity} is named twice", where=flag, entry=MessageCode.CSV_COLUMNS_UNCLEAR)
         column, colon, spelt = name.strip().rpartition(":")
-        unit = unit_of(quantity, spelt)
+        unit = unit_of(quantity, spelt, told=True)
         if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a complete name
             found[quantity] = ColumnChoice(quantity, name.strip())
         elif column and unit is not None:
@@ -213,7 +260,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     """
     best: tuple[tuple[int, int, int], int, list[str]] | None = None
     usual = ",".join(_STANDARD[choice.quantity] for choice in choices)
-    sensor = _flag(choices) == REFERENCE_FLAG
+    sensor = columns_flag(choices) == REFERENCE_FLAG
     for number, line in enumerate(lines[:HEADER_LINES], 1):
         for delimiter in DELIMITERS:
             if delimiter not in line:
@@ -275,16 +322,16 @@ def _one_each(
             several = ", ".join(repr(shown(names[at])) for at in positions[:4])
             raise CsvMisnamed(
                 f"{len(positions)} columns could be {choice.quantity}: {several}", where=where,
-                next_step=f"Name one with {_flag(choices)}, and rename it in the file if the names are the same",
+                next_step=f"Name one with {columns_flag(choices)}, and rename it in the file if the names are the same",
             )
     chosen = tuple(positions[0] for positions in found)
     if len(set(chosen)) < len(chosen):
         raise CsvMisnamed("one column would hold two quantities", where=where,
-                          next_step=f"Name all with {_flag(choices)}")
+                          next_step=f"Name all with {columns_flag(choices)}")
     return chosen
 
 
-def _flag(choices: Choices) -> str:
+def columns_flag(choices: Choices) -> str:
     """Return the option that names these columns: `--column` for a reference without a speed, else `--columns`."""
     return _WHERE if len(choices) == len(QUANTITIES) else REFERENCE_FLAG
 
@@ -293,7 +340,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
     there = [name for name in names if name]
     listed = ", ".join(shown(name) for name in there[:12]) + (", …" if len(there) > 12 else "")
     wanted = choice.name or choice.quantity
-    sensor = _flag(choices) == REFERENCE_FLAG
+    sensor = columns_flag(choices) == REFERENCE_FLAG
     others = [] if choice.name else [name for name in there if choice.quantity in name.casefold()
                                      and is_setpoint(choice.quantity, name, sensor=sensor)]
     if others:
@@ -301,7 +348,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
         return CsvMisnamed(
             f"no column holds the actual {choice.quantity}. By name, {several} {'is' if len(others) == 1 else 'are'} a "
             "setpoint, a limit or an error", where=where,
-            next_step=f"Name the column of the actual {choice.quantity}: {_flag(choices)} {choice.quantity}=…. "
+            next_step=f"Name the column of the actual {choice.quantity}: {columns_flag(choices)} {choice.quantity}=…. "
             f"The columns are: {listed}. A setpoint is read only if it is named here",
         )
     folded = {_folded(form): name for name in there for form in (split_name(name)[0], name)}
@@ -310,7 +357,7 @@ def _no_column(choice: ColumnChoice, names: Sequence[str], where: str, choices: 
     missing = f"no column {shown(wanted)!r}" if choice.name else f"no column is called {choice.quantity}"
     step = f"The columns are: {listed}"
     if not choice.name:
-        step += f". Say which is which: {_flag(choices)} {' '.join(f'{one.quantity}=…' for one in choices)}"
+        step += f". Say which is which: {columns_flag(choices)} {' '.join(f'{one.quantity}=…' for one in choices)}"
     return CsvMisnamed(f"{missing}{hint}", where=where, next_step=step)
 
 
@@ -348,11 +395,11 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
         (row for at, row in rows.items() if at < first and _states_units(quantities, row)), [""] * len(choices)
     )
     clock = ":" in rows[first][0]
-    # the first lines, and some later ones with a comma if it is no separator: at standstill all values are 0
-    later = (line for line in lines[first + _LOOKED_AT:] if "," in line) if header.delimiter != "," else ()
-    seen = [_wanted(line, header)
-            for line in chain(lines[first:first + _LOOKED_AT], islice(later, _LOOKED_AT))]
-    sign = decimal_sign(row[1:] if clock else row for row in seen)
+    # the first lines, and some later ones with a sign that is no separator: at standstill all values are 0
+    later = chain.from_iterable(islice((line for line in lines[first + _LOOKED_AT:] if sign in line), _LOOKED_AT)
+                                for sign in ",." if header.delimiter != ",")
+    seen = [_wanted(line, header)[clock:] for line in chain(lines[first:first + _LOOKED_AT], later)]
+    sign = decimal_sign(seen)
     if sign == "?":
         raise CsvUnusable(
             "some numbers have a decimal comma and some a decimal point", where=f"{file}:{first + 1}",
@@ -366,15 +413,26 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayo
             assumed.append(f"{file}: clock times; the first row is at 0 s")
             continue
         name = header.names[header.columns[position]]
-        unit, notes = _unit(choice, name, stated[position], where, _flag(choices))
+        unit, notes = _unit(choice, name, stated[position], where, columns_flag(choices))
         units.append(unit)
         assumed += [f"{file}: {note}" for note in notes]
+    # a table with commas between its cells has no points between thousands, and a drive's trace no steps of 1 s
+    if (sign == "," or header.delimiter != ",") and (clock or units[0].factor < 1.0 or not any(
+            sign in row[0] for row in seen)) and (doubt := perhaps_thousands(seen)) is not None:
+        at, cell = doubt
+        name, word = shown(header.names[header.columns[at + clock]]), "comma" if sign == "," else "point"
+        raise CsvUnusable(
+            f"the {word} in {cell!r}, of column {name!r}, may be a decimal sign or may separate thousands",
+            where=f"{file}:{first + 1}",
+            next_step=f"Export again without signs between thousands. If the {word} is the decimal sign, write one "
+            f"number of this column with four decimals in a copy of the file, such as {cell}0",
+        )
     return ColumnLayout(header, first + 1, tuple(units), clock, sign == ",", tuple(assumed))
 
 
 def _states_units(quantities: Sequence[str], row: Sequence[str]) -> bool:
-    """Return whether a row below the header is a row of units: one is known, or all are in brackets."""
-    return any(map(unit_of, quantities, row)) or all(
+    """Return whether a row below the header is a row of units: one is a unit, or all are in brackets."""
+    return any(map(unit_of, quantities, row)) or any(_is_any_unit(cell.strip("[](){}<> ")) for cell in row) or all(
         (found := _BRACKETED.match(cell.strip())) is not None and not found.group(1) for cell in row)
 
 
@@ -407,30 +465,38 @@ def _unit(choice: ColumnChoice, name: str, stated: str, where: str, flag: str) -
              "as told"] if is_setpoint(quantity, name, sensor=flag == REFERENCE_FLAG) else []
     if choice.unit is not None:
         other = below or named
+        if choice.unit.symbol == "Hz":
+            notes.append(f"{shown(name)!r} in Hz was read as revolutions of the shaft a second, as told")
         if other is not None and other != choice.unit:
             notes.append(f"{quantity} was read in {choice.unit.symbol} as told; the file says {other.symbol}")
         return choice.unit, notes
-    next_step = f"Give it behind a colon: {flag} {quantity}='{shown(name)}:{SI[quantity]}'"
     # SI is assumed only if the file states no unit: a unit that is not known would be a wrong factor
-    odd = stated if below is None and not is_missing(stated) else ""
-    if named is None and below is None:
-        odd = odd or split_name(name)[1]
+    odd = stated if below is None and not is_missing(stated) else odd_unit(quantity, name) if below is None else ""
+    next_step = f"behind a colon: {flag} {quantity}='{shown(name)}:…'"
     if odd:
-        raise CsvMisnamed(
-            f"{shown(odd)!r}, of column {shown(name)!r}, is not a unit of {quantity}; "
-            f"use {', '.join(known_units(quantity))}",
-            where=where, next_step=f"{next_step}, with the column's unit, or convert the column",
-        )
+        what, first = f"{shown(odd)!r}, of column {shown(name)!r}, is ", "Convert the column"
+        if quantity == "torque" and odd.casefold() in _CURRENTS:
+            what += "a unit of current. A current is not a torque"
+            first += " with the torque constant of the motor"
+        elif quantity == "speed" and odd.casefold() == "hz":
+            what += ("a frequency. The output frequency of an inverter is that of the stator: the pole pairs times the "
+                     "turns of the shaft a second, plus slip")
+            raise CsvMisnamed(what, where=where, next_step="Export the actual speed of the motor, such as in rpm. If "
+                              f"the column is the turns of the shaft a second, state Hz {next_step[:-2]}Hz'")
+        else:
+            what += f"not a unit of {quantity}; use {', '.join(known_units(quantity))}"
+        raise CsvMisnamed(what, where=where,
+                          next_step=f"{first}. If it is a {quantity} in another unit, state this unit {next_step}")
     if below is not None and named is not None and below != named:
         raise CsvMisnamed(
             f"the unit of {shown(name)!r} is {named.symbol} by its name but {below.symbol} by the row of units",
-            where=where, next_step=next_step,
+            where=where, next_step=f"State the right one {next_step}",
         )
     unit = below or named
     if unit is None:
         si = unit_of(quantity, SI[quantity])
         assert si is not None
-        return si, [*notes, f"no unit is stated for {shown(name)!r}; {SI[quantity]} was assumed"]
+        return replace(si, assumed=True), [*notes, f"no unit is stated for {shown(name)!r}; {SI[quantity]} was assumed"]
     if unit.symbol == "1/s":
         return unit, [*notes, f"{shown(name)!r} in 1/s was read as revolutions a second"]
     return unit, notes

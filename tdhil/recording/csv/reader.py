@@ -11,9 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError
+from tdhil.errors import CsvMisnamed, CsvUnusable, MessageCode, UsageError, shown
 from tdhil.recording.csv.excitation import load_excitation
-from tdhil.recording.csv.layout import REFERENCE_FLAG, USUAL, Choices, ColumnLayout, find_layout, named
+from tdhil.recording.csv.layout import (
+    REFERENCE_FLAG,
+    USUAL,
+    Choices,
+    ColumnLayout,
+    columns_flag,
+    find_layout,
+    named,
+)
 from tdhil.recording.csv.text import (
     LARGEST,
     ClockReader,
@@ -145,6 +153,7 @@ class RowReader:
 LONGEST_S = 7 * 86400.0
 _MOST_DROPPED = 0.10      # largest share of rows dropped; with more it is not one recording
 GAP_INTERVALS = 5.0       # usual intervals, from which a gap is reported
+LEAST_GAP_S = 0.1         # shortest gap that is left where a clock was set back. A choice: estimation bridges 0.05 s
 
 
 def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, list[str]]:
@@ -161,15 +170,18 @@ def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, 
     warnings = []
     if len(lost):
         first = int(lost[0])
-        same = float(np.mean(np.isin(time_s[lost], time_s[keep]))) if len(lost) < 100_000 else _same(time_s)
-        how = "repeats itself" if same > 0.5 else "goes back"
+        step = float(time_s[first] - time_s[first - 1])
+        how = "repeats itself" if step == 0.0 else "goes back" if step < 0.0 else "jumps ahead and back"
         if len(lost) > _MOST_DROPPED * len(time_s):
             raise CsvUnusable(
                 f"the time {how}, here and in {len(lost) - 1} more of {len(time_s)} rows",
                 where=f"{file}:{lines[first]}",
                 next_step="Export one recording, in its order, with time stamps as fine as the samples",
             )
-        warnings.append(f"{file}:{lines[first]}: {_row_list(len(lost))} dropped, where the time {how}")
+        apart = _kept_apart(time_s, keep)
+        by = f" by {-step:.3g} s" if step < 0.0 else ""
+        warnings.append(f"{file}:{lines[first]}: {_row_list(int(np.sum(~keep)))} dropped, where the time {how}{by}"
+                        + ("; a gap was left there, because the clock was set back" if apart else ""))
     steps = np.diff(time_s[keep])
     if not len(steps):
         return keep, warnings
@@ -187,9 +199,20 @@ def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, 
     return keep, warnings
 
 
-def _same(time_s: FloatArray) -> float:
-    falls = np.diff(time_s)
-    return float(np.mean(falls[falls <= 0.0] == 0.0)) if np.any(falls <= 0.0) else 0.0
+def _kept_apart(time_s: FloatArray, keep: BoolArray) -> bool:
+    """Leave out further rows in ``keep``, so that a gap remains where the clock was set back; return whether it was.
+
+    The rows after such a place continue from the earlier time. Those behind the highest time so far are later than
+    their stamps say, and the motion between both parts is not known. A single stamp out of order is no such place.
+    """
+    lost = ~keep
+    begins = 1 + np.flatnonzero(lost[1:-1] & lost[2:] & (time_s[1:-1] < time_s[:-2]) & (time_s[2:] > time_s[1:-1]))
+    kept = np.flatnonzero(keep)
+    highest = time_s[kept][np.searchsorted(kept, begins) - 1]
+    gap_s = max(LEAST_GAP_S, (GAP_INTERVALS + 1.0) * float(np.median(np.diff(time_s[kept])))) if len(kept) > 1 else 0.0
+    for first, last in np.searchsorted(time_s[kept], np.stack([highest, highest + gap_s], axis=1), side="right"):
+        keep[kept[first:last]] = False
+    return len(begins) > 0
 
 
 def _row_list(count: int) -> str:
@@ -281,6 +304,8 @@ def _read_columns(
     if whole:
         again = np.concatenate([[False], np.all([np.diff(column) == 0.0 for column in columns], axis=0)])
         columns, lines = [column[~again] for column in columns], lines[~again]
+    if layout.units[0].assumed and len(lines) > 1:
+        _check_seconds(float(np.median(np.diff(columns[0]))), layout, choices, file)
     keep, notes = rising(columns[0], lines, file)
     if not np.all(keep):
         columns = [column[keep] for column in columns]
@@ -289,6 +314,24 @@ def _read_columns(
         raise CsvUnusable(f"a reference must be whole: {what}", where=f"{file}:{where}",
                           next_step="Correct or remove this line in a copy of the file, or export it again")
     return columns, (*warnings, *dropped, *notes)
+
+
+COARSE_S = 1.0
+"""Step of the time, s, from which a time without a unit is not taken for seconds. A choice: drives, PLCs and loggers
+sample faster, and their counts of samples and of milliseconds have steps of 1 and more."""
+
+
+def _check_seconds(step: float, layout: ColumnLayout, choices: Choices, file: str) -> None:
+    """Raise CsvMisnamed for a time without a unit whose usual step is too large for seconds."""
+    if step < COARSE_S:
+        return
+    name, flag = shown(layout.header.names[layout.header.columns[0]]), columns_flag(choices)
+    raise CsvMisnamed(
+        f"no unit is stated for {name!r}, whose usual step is {step:g}. It may count milliseconds or samples",
+        where=f"{file}:{layout.header.line}",
+        next_step=f"State its unit: {flag} time='{name}:ms', or ':s' if it is in seconds. If it counts samples, divide "
+        "it by the sample rate in a copy of the file",
+    )
 
 
 def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> list[float]:

@@ -105,7 +105,10 @@ class ClockReader:
 # Cells and the numbers in them: quotes, decimal comma or point, signs between thousands.
 #
 # A dot in a column with decimal commas, or a comma in one with decimal points, is accepted only if it must separate
-# thousands (``1.234,5``, ``1,234.5``). ``1.234`` in a column with ``0,5`` is ambiguous, and is not accepted.
+# thousands (``1.234,5``, ``1,234.5``). ``1.234`` in a column with ``0,5`` is ambiguous, and is not accepted. In a file
+# without any such sign of the other kind, ``1.234`` may still be 1234. A sign is a decimal one if one cell has another
+# number of decimals, begins with 0, or has four digits in its whole part. Else each cell with it has three decimals: a
+# fixed format, which has no integers in its column and as many decimals in most columns, or thousands.
 
 
 LARGEST = 1e12        # in SI; a larger value is a place-holder such as 3.4e38
@@ -113,6 +116,8 @@ _MISSING = {"", "-", "--", "nan", "n/a", "na", "#n/a", "null", "none", "inf", "-
 _POINTED = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d*")
 _COMMAED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d*")
 _DIGITS = re.compile(r"[+-]?\d*[.,]?\d*([eE][+-]?\d+)?")
+_THREE = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
+_INTEGER = re.compile(r"[+-]?0*([1-9]\d*)")
 _SPACES = str.maketrans({"\u2212": "-", "\u00a0": None, "\u202f": None, "'": None, "’": None})
 
 
@@ -180,6 +185,26 @@ def decimal_sign(rows: Iterable[Sequence[str]]) -> str:
     if len(signs) > 1:
         return "?"
     return signs.pop() if signs else "."
+
+
+def perhaps_thousands(rows: Iterable[Sequence[str]]) -> tuple[int, str] | None:
+    """Return the column whose only sign may separate thousands, and such a cell; None if the sign is a decimal one."""
+    three: dict[int, str] = {}
+    digits: dict[int, int] = {}        # most digits of an integer other than 0, by column
+    for row in rows:
+        for at, cell in enumerate(row):
+            text = cell.translate(_SPACES)
+            if _THREE.fullmatch(text):
+                three.setdefault(at, text)
+            elif found := _INTEGER.fullmatch(text):
+                digits[at] = max(digits.get(at, 0), len(found[1]))
+            elif ("." in text or "," in text) and _DIGITS.fullmatch(text):
+                return None
+    if any(digits.get(at, 0) > 3 for at in three):
+        return None
+    mixed = [at for at in three if at in digits]
+    chosen = mixed or (list(three) if len(three) == 1 else [])
+    return (chosen[0], three[chosen[0]]) if chosen else None
 
 
 # ---------------------------------------------------------------------------------------------------------------------
