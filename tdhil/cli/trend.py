@@ -98,10 +98,11 @@ def run_compare(namespace: argparse.Namespace) -> int:
                          entry=MessageCode.LOG_NEEDED)
     for log in namespace.logs:
         require_log(log)
-        require_log_kind(log, "tdhil compare before.mcap after.mcap")
         if not namespace.archived and is_archived(log):
             raise UsageError("tdhil serve has archived this run", where=str(log),
                              next_step="Add --archived, or leave it out", entry=MessageCode.VALUE_NOT_ALLOWED)
+    for log in namespace.logs:
+        require_log_kind(log, "tdhil compare before.mcap after.mcap")
     settings = FleetSettings(**settings_in(namespace))
     report = ReportFile.of_files(namespace, *namespace.logs)
     runs = []

@@ -64,6 +64,7 @@ def preflight() -> Preflight:
     row = Check(EVIL, EVIL, EVIL, Outcome.REFUSED, EVIL, EVIL)
     known = {
         "identity": Identity(1, 2, 3, 4, EVIL, False), "checks": (row,), "watchdog_s": 0.5, "safe_action": "quick_stop",
+        "modes": frozenset(),
     }
     names = signature(Preflight).parameters
     rest = {name: 1.0 for name, one in names.items() if one.default is one.empty and name not in known}

@@ -100,7 +100,7 @@ def fields_of(**changed):
     ({"limits": LIMITS | {"speed_max_rad_s": "95 rpmm"}}, "limits.speed_max_rad_s", "'rpmm' is not a unit"),
     ({"limits": LIMITS | {"probe_torque_nm": "900"}}, "limits.probe_torque_nm", "Must not be above torque_nm"),
     ({"string": {}}, "make_up_torque_nm", "A drill string needs it"),
-    ({"gear_ratio": "0"}, "gear_ratio", "Must be at least"),
+    ({"gear_ratio": "0"}, "gear_ratio", "Must be greater than 0"),
     ({"simulated": True, "limits": {"torque_nm": "400"}}, "limits.time_s", "all limits or none"),
     ({"accept_unverified": []}, "accept_unverified", "only if both agree: modes, quick_stop"),
 ])
