@@ -796,8 +796,11 @@ class StopSequence:
         return self._polls.only
 
     def _gets_slower(self, sample: Sample) -> bool:
-        """Return False if only polls, which feed an armed watchdog, show the shaft and it does not slow down."""
-        feeding = self._watched and self._fed and self._polls.standing
+        """Return False if only polls, which feed an armed watchdog, show the shaft and it does not slow down.
+
+        A drive without torque has no watchdog that acts: its shaft is watched as it runs out.
+        """
+        feeding = self._watched and self._fed and self._polls.standing and sample.state not in NO_TORQUE
         if not feeding or self._slowing.see(sample.time_s, sample.speed_rad_s):
             return True
         self._trouble.append(

@@ -107,6 +107,18 @@ def test_a_shaft_that_brakes_on_a_slow_ramp_is_not_left_to_the_watchdog(world):
     assert report.confirmed, report.trouble
 
 
+def test_a_shaft_without_torque_is_not_left_to_a_watchdog(world):
+    """A string may hold up its speed for seconds, and no watchdog of a drive without torque acts."""
+    here = world(LookedAt(viscous=0.0, coulomb=0.0))
+    here.turn(3.0)
+    here.drive.gone = "missing"
+    here.drive.state = here.drive.wish = PowerState.OFF
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed and not any("left alone" in line for line in report.trouble)
+    assert here.bench.now_s - begun_s > 2.0 * (AFTER_S + SLOWING_S)
+
+
 def test_a_poll_that_contradicts_the_cycle_is_repeated_after_a_standstill_and_reported_once(world):
     @dataclass
     class Stuck(LookedAt):
