@@ -98,7 +98,7 @@ def holes(r, rng):
     return taken(r, keep)
 
 
-@family("did not change although")
+@family("did not change for")
 def feedback_stuck(r, rng):
     speed, torque = r.speed_rad_s.copy(), r.torque_nm.copy()
     begin = int(np.searchsorted(r.time_s, moment(rng)))
@@ -107,7 +107,7 @@ def feedback_stuck(r, rng):
     return replace(r, speed_rad_s=speed, torque_nm=torque)
 
 
-@family("did not change although")
+@family("did not change for")
 def one_signal_stuck(r, rng):
     signal = r.torque_nm.copy()
     begin = int(np.searchsorted(r.time_s, moment(rng)))
