@@ -44,7 +44,6 @@ OF_THE_TERMINAL = {
     "tdhil/runner/virtual_string_program.py": "tdhil evaluate",
     "tdhil/service/new_rig.py": "arguments of a process",
     "tdhil/service/supervisor.py": "arguments of a process",
-    "tdhil/service/worker.py": "arguments of a process",
     "tdhil/session/evaluation.py": "tdhil evaluate",
     "tdhil/calibration/reference.py": "tdhil calibrate torque with a reference sensor",
     "tdhil/session/speed_calibration.py": "tdhil calibrate speed",

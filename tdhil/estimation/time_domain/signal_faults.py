@@ -28,7 +28,7 @@ _OPPOSES = -0.3           # correlation of torque and acceleration, below which 
 
 
 @dataclass(frozen=True)
-class _Blocks:
+class _BlockMeans:
     """Means over B blocks of ``size`` samples."""
 
     size: int
@@ -59,7 +59,7 @@ def refuse_faulty_signals(samples: Samples, speed_quantum: float, torque_quantum
         return
     time, speed, torque = (signal[: size * count].reshape(count, size).mean(axis=1)
                            for signal in (samples.time_s, samples.speed_rad_s, samples.torque_nm))
-    blocks = _Blocks(size, speed, torque, np.gradient(speed, time))
+    blocks = _BlockMeans(size, speed, torque, np.gradient(speed, time))
     for name, unit, other, signal, quantum, partner in (
         ("torque", "N·m", "acceleration", samples.torque_nm, torque_quantum, blocks.rate),
         ("speed", "rad/s", "torque", samples.speed_rad_s, speed_quantum, blocks.torque),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from profiles.quantities import in_rad_s_and_rpm, rpm_advice
-from tdhil.config import DEFAULT_EXCITATION, identified_before_echo
+from tdhil.config import DEFAULT_EXCITATION, OPTION, identified_before_echo
 from tdhil.recording import Segment
 from tdhil.runner.excitation import signals
 from tdhil.runner.excitation.reference import (
@@ -380,7 +380,7 @@ def _amplitude_and_offsets(fits: list[_FittedShape], wish: PlanRequest) -> tuple
     low, high = fits[0].limits.usable_low_rad_s, fits[0].limits.usable_high_rad_s
     window = f". A plan uses {in_rad_s_and_rpm(low, high)}" if limit.startswith("speed window") else ""
     if largest <= 0.0:
-        advice = rpm_advice(where, "--offset", low, high) if wish.offsets_rad_s else "Change"
+        advice = rpm_advice(where, OPTION["offset_rad_s"].flag, low, high) if wish.offsets_rad_s else "Change"
         raise PlanRefused(f"{limit} leaves no room for any excitation at {in_rad_s_and_rpm(where)}{window}",
                           USUAL_STEP.replace("Change", advice))
     amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
@@ -388,7 +388,7 @@ def _amplitude_and_offsets(fits: list[_FittedShape], wish: PlanRequest) -> tuple
         raise PlanRefused(
             f"{limit}: an amplitude of {in_rad_s_and_rpm(amplitude)} at {in_rad_s_and_rpm(where)} does not fit; "
             f"{in_rad_s_and_rpm(largest)} would fit{window}",
-            USUAL_STEP.replace("Change", rpm_advice(amplitude, "--amplitude", 0.0, largest)),
+            USUAL_STEP.replace("Change", rpm_advice(amplitude, OPTION["amplitude_rad_s"].flag, 0.0, largest)),
         )
     return amplitude, tuple(offsets)
 
