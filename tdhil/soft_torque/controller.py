@@ -240,6 +240,11 @@ def margins(drive: TopDrive, controller: SpeedController, string: DrillString | 
     return Margins(phase, crossover, float(np.min(np.abs(1.0 + whole))))
 
 
+def phase_lag_rad(drive: TopDrive, omega: float) -> float:
+    """Return the phase lag of H at ``omega``, rad."""
+    return sum(atan(lag * omega) for lag in drive.inner_lags_s)
+
+
 def stiff_controller(drive: TopDrive, phase_margin_deg: float, integral_share: float = 0.1) -> SpeedController:
     """Return the stiffest PI controller that keeps the phase margin, with I/P = ω_c/10.
 
@@ -253,7 +258,7 @@ def stiff_controller(drive: TopDrive, phase_margin_deg: float, integral_share: f
 
     def margin(omega: float) -> float:
         rotor = atan2(drive.inertia_kg_m2 * omega, drive.viscous_nm_s_rad)
-        return pi - rotor - atan(integral_share) - sum(atan(lag * omega) for lag in drive.inner_lags_s)
+        return pi - rotor - atan(integral_share) - phase_lag_rad(drive, omega)
 
     low, high = 1e-6 / drive.total_lag_s, 10.0 / drive.total_lag_s
     if not margin(low) > wanted > margin(high):

@@ -247,14 +247,24 @@ class WaveLine:
     """True: a section of the bottom-hole assembly."""
 
     @property
+    def has_friction(self) -> bool:
+        """Return whether the line has drag or dry friction."""
+        return self.drag_nm_s_rad_m > 0.0 or self.coulomb_nm_m > 0.0
+
+    @property
     def impedance_nm_s_rad(self) -> float:
         """Characteristic impedance ζ without drag, N·m·s/rad."""
         return sqrt(self.inertia_kg_m / self.compliance_rad_nm_m)
 
     @property
+    def speed_m_s(self) -> float:
+        """Speed c of the waves, m/s."""
+        return 1.0 / sqrt(self.inertia_kg_m * self.compliance_rad_nm_m)
+
+    @property
     def delay_s(self) -> float:
-        """Travel time of a wave from end to end, s, at the speed c = 1/√(i κ) of waves; i and κ are a metre's."""
-        return self.length_m / (1.0 / sqrt(self.inertia_kg_m * self.compliance_rad_nm_m))
+        """Travel time of a wave from end to end, s."""
+        return self.length_m / self.speed_m_s
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,11 @@ class Prediction:
     """True: the critical speed has no upper end, because it is above the highest speed that `tune` tried on some draws.
     The end of ``cure_rpm`` is then its value."""
 
+    @property
+    def cure_words(self) -> str:
+        """Return the interval of the critical speed, rpm, in words."""
+        return f"{self.cure_rpm.low:.0f} {'or more' if self.cure_open else f'to {self.cure_rpm.high:.0f}'}"
+
 
 @dataclass(frozen=True)
 class RigWindow:
@@ -349,9 +354,7 @@ def _verdict(
             return (EvaluationOutcome.NOT_FOUND,
                     f"the run ended at {reached / RPM:.0f} rpm, before a bit that was stuck kept turning")
         return EvaluationOutcome.NOT_FOUND, "a stuck bit did not keep turning at any set speed, up to the highest one"
-    cure = case.prediction.cure_rpm
-    words = (f"critical speed {critical.value:.1f} rpm, predicted {cure.low:.0f} "
-             f"{'or more' if case.prediction.cure_open else f'to {cure.high:.0f}'}")
+    words = f"critical speed {critical.value:.1f} rpm, predicted {case.prediction.cure_words}"
     if disturbed is not None:
         words += (f"; under the {unknown_nm:.0f} N·m rms of torque that was not commanded, the bit turns in "
                   f"{disturbed.turning_at(critical.value)} of {TRIALS} simulated trials at the first speed, and in "

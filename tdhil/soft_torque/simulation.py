@@ -151,7 +151,7 @@ def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid
     tick = float(min(candidates, key=lambda one: rounded(float(one))[1] / one**0.25))
     counts = tuple(int(count) for count in rounded(tick)[0])
     parts = tuple(
-        max(1, min(count, round(line.delay_s / DRAG_EVERY_S))) if line.drag_nm_s_rad_m or line.coulomb_nm_m else 1
+        max(1, min(count, round(line.delay_s / DRAG_EVERY_S))) if line.has_friction else 1
         for line, count in zip(string.lines, counts, strict=True)
     )
     return _cut(string, tick, counts, parts, light)

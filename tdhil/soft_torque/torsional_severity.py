@@ -80,10 +80,16 @@ REFLECTION_TOLERANCE = 0.1
 """Largest distance of the expected |r| from the measured interval. It accounts for lags that are not known exactly."""
 
 
+NOT_IDENTIFIABLE = 9
+"""Exit code: the record does not determine the requested quantity."""
+
+
 class SeverityRefused(TdhilError):
     """Refusal: the record does not determine the torsional motion of the string. The message gives the reason."""
 
-    entry, exit_code = MessageCode.SEVERITY_REFUSED, 9      # not identifiable
+    entry = MessageCode.SEVERITY_REFUSED
+
+    exit_code = NOT_IDENTIFIABLE
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,11 @@ class TuneCase:
         return Interval(whole.value, whole.value - share * (whole.value - whole.low),
                         whole.value + share * (whole.high - whole.value))
 
+    @property
+    def at_inertias(self) -> tuple[TopDrive, ...]:
+        """The drive at the `STEPS` values of J of `inertias`."""
+        return tuple(self.drive.with_inertia(one) for one in self.inertias(STEPS))
+
     def inertias(self, steps: int) -> tuple[float, ...]:
         """Return ``steps`` (odd) values of J from end to end of `inertia_alone`, with the estimated J in the middle."""
         alone = self.inertia_alone

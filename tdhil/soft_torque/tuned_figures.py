@@ -29,7 +29,7 @@ from tdhil.soft_torque.controller import (
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.stability import is_stable, loop_margins
 from tdhil.soft_torque.truth_margins import TruthMargins
-from tdhil.soft_torque.tune_case import STEPS, TuneCase, Tuned, WrongInertia
+from tdhil.soft_torque.tune_case import TuneCase, Tuned, WrongInertia
 from tdhil.soft_torque.uncertainty import Interval
 
 BAND_HZ = (0.05, 1.5)
@@ -87,7 +87,7 @@ def with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], samples: T
     """Return the row with its figures. The row must have gains."""
     law = tuned.controller
     assert law is not None
-    along = np.array([figures_at(case, case.drive.with_inertia(j), law, held) for j in case.inertias(STEPS)])
+    along = np.array([figures_at(case, drive, law, held) for drive in case.at_inertias])
     present = tuned.kind == "present"
     pairs = case.moves(present=present)
     heard = [[held if end.string is case.string else string_modes_hz(end.string) for end in pair] for pair in pairs]
