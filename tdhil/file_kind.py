@@ -6,19 +6,25 @@ from pathlib import Path
 
 from tdhil.errors import MessageCode, UsageError
 
-_MCAP = b"\x89MCAP0\r\n"
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP file."""
 _HEAD_BYTES = 65_536
 LOG, RESULT, PAGE, PDF = "a log", "a result of tdhil", "an HTML page", "a PDF file"
 
 
+def begins_like_log(head: bytes) -> bool:
+    """Return whether these are the first bytes of an MCAP file, also if they are only some of them."""
+    return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
+
+
 def kind_of(path: Path) -> str:
-    """Return what the file is, such as ``a result of tdhil``; '' if neither content nor ending shows it."""
+    """Return the kind of a file, such as ``a result of tdhil``; '' if neither content nor ending shows it."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except OSError:                     # the reader of the file reports it
         return ""
-    if head.startswith(_MCAP[:5]) or (head and _MCAP.startswith(head)):
+    if begins_like_log(head):
         return LOG
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if text.startswith(b"{"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from profiles import CodedText, MessageCode
-from tdhil.recording import BoolArray, FloatArray, Recording, Segment, Stage
+from tdhil.recording import BoolArray, FloatArray, IntArray, Recording, Segment, Stage
 
 LONGEST_LAG_S = 0.5
 """Longest plausible time constant of a reported speed or torque, s."""
@@ -86,9 +86,14 @@ def _step(signal: FloatArray, quantum: float) -> float:
     return max(seen, quantum) if np.isfinite(quantum) else seen
 
 
+def edges_of_runs(signal: FloatArray | BoolArray) -> IntArray:
+    """Return the first index of each run of equal values, then the length of the signal, (runs + 1,)."""
+    return np.concatenate([[0], np.flatnonzero(signal[1:] != signal[:-1]) + 1, [len(signal)]])
+
+
 def _long_runs(time: FloatArray, signal: FloatArray, longest_s: float) -> list[tuple[int, int]]:
     """Return the runs [begin, end) of equal values that last longer than ``longest_s`` and have enough samples."""
-    edges = np.concatenate(([0], np.flatnonzero(signal[1:] != signal[:-1]) + 1, [len(signal)]))
+    edges = edges_of_runs(signal)
     many = np.flatnonzero(np.diff(edges) >= _LEAST_SAMPLES)
     begins, ends = edges[many], edges[many + 1]
     lasting = time[ends - 1] - time[begins] > longest_s

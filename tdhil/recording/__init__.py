@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_writer import RunWriter as RunWriter
     from tdhil.recording.mcap_container import schema_of as schema_of
-    from tdhil.recording.mcap_records import MAGIC as MAGIC
     from tdhil.recording.npz_cache import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, ImpedanceInput as ImpedanceInput,
@@ -60,7 +59,6 @@ else:
         "log_tail": "LogChunks LoggedMessage LogNews LogTail messages_in",
         "log_writer": "RunWriter",
         "mcap_container": "schema_of",
-        "mcap_records": "MAGIC",
         "npz_cache": "pack_recording unpack_recording",
         "recording": "BoolArray Excitation FloatArray ImpedanceInput IntArray LagPrior Level Pipe Ramp Recording "
                      "Segment Stage SteppedSetpoint TorqueAnswer ABORTED aborted_stage before_abort counts_until_s",

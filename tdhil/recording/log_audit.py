@@ -15,6 +15,7 @@ from typing import Any, Final
 import zstandard
 
 from tdhil.errors import LogBroken
+from tdhil.file_kind import MAGIC
 from tdhil.recording.log_format import CHANNELS, CLASSES, RAW_FRAMES, SAMPLE
 from tdhil.recording.log_reader import Ours, messages
 from tdhil.recording.mcap_records import (
@@ -25,7 +26,6 @@ from tdhil.recording.mcap_records import (
     DATA_END,
     FOOTER,
     HEADER,
-    MAGIC,
     MESSAGE,
     MESSAGE_INDEX,
     METADATA,

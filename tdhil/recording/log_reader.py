@@ -14,12 +14,13 @@ from google.protobuf.message import DecodeError
 
 from drivers import Command, PowerState, RawFrame, Sample
 from tdhil.errors import LogError
+from tdhil.file_kind import MAGIC
 from tdhil.recording import log_format, log_messages
 from tdhil.recording.builder import FACTS, RecordingBuilder, structure
 from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable, TorqueCommand
 from tdhil.recording.log_format import CHANNELS, CLASSES, MODE_OF, PACKAGE, RECOVERED, STATE_OF, Event, schema_name
 from tdhil.recording.log_messages import TEXT_LIMIT
-from tdhil.recording.mcap_records import CHANNEL, MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, SCHEMA
+from tdhil.recording.mcap_records import CHANNEL, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, SCHEMA
 from tdhil.recording.mcap_recovery import Contents, Damage, Library, Whole, walk
 from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 

@@ -17,11 +17,12 @@ import numpy as np
 import zstandard
 from google.protobuf.message import DecodeError
 
+from tdhil.file_kind import MAGIC
 from tdhil.recording import log_format
 from tdhil.recording.builder import structure
 from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable
 from tdhil.recording.log_format import CHANNELS, CLASSES, Event, LiveInertia
-from tdhil.recording.mcap_records import CHUNK, DATA_END, MAGIC, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
+from tdhil.recording.mcap_records import CHUNK, DATA_END, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from tdhil.recording.mcap_recovery import CHUNK_LIMIT, Contents, chunk_head, contents, read_at
 from tdhil.recording.recording import FloatArray, Stage
 

@@ -26,8 +26,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Schema, Statistics, SummaryOffset
 
+from tdhil.file_kind import MAGIC
 from tdhil.recording.log_format import CHANNELS, CLASSES, PACKAGE, schema_name
-from tdhil.recording.mcap_records import MAGIC
 from tdhil.version import __version__
 
 LIBRARY: Final = f"{PACKAGE} {__version__}"

@@ -11,7 +11,6 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-MAGIC: Final = b"\x89MCAP0\r\n"     # first and last bytes of the file
 RECORD_HEAD: Final = Struct("<BQ")
 MESSAGE_HEAD: Final = Struct("<HIQQ")
 

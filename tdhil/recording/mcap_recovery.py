@@ -20,6 +20,7 @@ from zlib import crc32
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
+from tdhil.file_kind import MAGIC
 from tdhil.recording.mcap_records import (
     ATTACHMENT,
     CHUNK,
@@ -27,7 +28,6 @@ from tdhil.recording.mcap_records import (
     FOOTER,
     HEADER,
     KNOWN,
-    MAGIC,
     MESSAGE_INDEX,
     METADATA,
     RECORD_HEAD,

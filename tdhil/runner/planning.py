@@ -7,7 +7,8 @@ its scatter decides everything after it (`design.stopping_rule`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -135,9 +136,13 @@ def plan_acquisition(
     allowed_s = left_s if request.max_time_s is None else min(left_s, request.max_time_s)
     if not adaptive(request):
         chosen = choose(limits, guess, wish, known, request.confidence, request.max_time_s)
+        if (usual_s := chosen.plan.duration_s) > left_s:
+            with suppress(PlanRefused):
+                chosen = choose(limits, guess, wish, known, request.confidence, left_s)
         if chosen.plan.duration_s > left_s:
-            chosen = _within_limit(
-                chosen, left_s, lambda: choose(limits, guess, wish, known, request.confidence, left_s))
+            raise PlanRefused(
+                f"time: stage 5 takes {usual_s:.0f} s, and {max(0.0, left_s):.0f} s are left of limits.time_s",
+                "Raise limits.time_s in rig.yaml, or lower --periods or --max-time")
         return Planned(chosen.plan, known, chosen.half_width, chosen.usual_half_width, None, chosen.plan.duration_s)
     chosen = choose(limits, guess, wish, known, request.confidence)
     if chosen.plan.duration_s > allowed_s:
@@ -150,19 +155,6 @@ def plan_acquisition(
         return planned
     sooner = _with_pilot(request, replace(chosen, plan=soonest), known, allowed_s, soonest.counted)
     return sooner if sooner.stopping is not None and sooner.stopping.reachable else planned
-
-
-def _within_limit(longer: Choice, left_s: float, choose_shorter: Callable[[], Choice]) -> Choice:
-    """Return a plan that ends before the run's time limit. Raises PlanRefused if none does."""
-    try:
-        shorter = choose_shorter()
-    except PlanRefused:
-        shorter = longer
-    if shorter.plan.duration_s <= left_s:
-        return shorter
-    raise PlanRefused(
-        f"time: stage 5 takes {longer.plan.duration_s:.0f} s, and {max(0.0, left_s):.0f} s are left of limits.time_s",
-        "Raise limits.time_s in rig.yaml, or lower --periods or --max-time")
 
 
 def refuse_undersampled(request: ExcitationRequest, rate_hz: float) -> None:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 
 from starlette.responses import FileResponse, Response, StreamingResponse
 
-from tdhil.errors import MessageCode, UsageError
 from tdhil.service.acceptance_signature import FILE
 from tdhil.service.access import principal
 from tdhil.service.evidence_request import ARCHIVE
@@ -85,9 +84,7 @@ async def samples(site: Site, request: Request, body: None) -> Response:
     run = request.path_params["run"]
     folder = await off(lambda: site.store.place(run))
     if not (folder / "samples.csv").exists() and (folder / LOG).exists():
-        if not site.store.status(run).ended:
-            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended",
-                             entry=MessageCode.NOT_READY)
+        await off(lambda: site.store.require_finished_log(run))
         await site.work("samples", run, {})
     return await file_of(site, request, "samples.csv", "text/csv")
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.buses import DoctorFinding
-from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.errors import ExitCode, UsageError
 from tdhil.service.access import address_of, principal, require_options
 from tdhil.service.middleware import off
 from tdhil.service.routing import apis
@@ -27,7 +27,6 @@ from tdhil.service.schemas import (
     TrendView,
 )
 from tdhil.service.start_request import EDITABLE, RigFile, ValuesWrong, options_of, require_motion, require_unwatched
-from tdhil.service.store import LOG
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -212,10 +211,7 @@ async def calibration(site: Site, request: Request, body: CalibrationBody) -> Ca
             if known.uploaded is not None:
                 raise request_wrong("is an uploaded recording: it is not certain that it is of this drive",
                                     f"run {run}", "Calibrate with tdhil calibrate torque")
-            if not (ended := site.store.status(run).ended) or not (site.store.place(run) / LOG).is_file():
-                raise UsageError("the run has no finished log", where=f"run {run}",
-                                 next_step="The run ended without a log" if ended else "Wait until it has ended",
-                                 entry=MessageCode.NOT_READY)
+            site.store.require_finished_log(run)
 
     await off(check)
     asked = {"without": body.without, "with_body": body.with_body, "added_kg_m2": body.added_kg_m2,

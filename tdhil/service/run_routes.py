@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import anyio
 
 from tdhil.config import ASKED_AGAIN, STATED, resolve
-from tdhil.errors import LogError, MessageCode, TdhilError, UsageError
+from tdhil.errors import LogError, TdhilError
 from tdhil.service.acceptance_signature import SIGNED
 from tdhil.service.access import principal
 from tdhil.service.accounts import ROLES
@@ -260,10 +260,7 @@ def _answers(made: ReplayView, asked: Mapping[str, Any]) -> bool:
 
 def _new_replay(site: Site, which: str, asked: dict[str, Any], who: str) -> ReplayView:
     folder = site.store.place(which)
-    if not (ended := site.store.status(which).ended) or not (folder / LOG).is_file():
-        raise UsageError("the run has no finished log", where=f"run {which}",
-                         next_step="The run ended without a log" if ended else "Wait until it has ended",
-                         entry=MessageCode.NOT_READY)
+    site.store.require_finished_log(which)
     with site.replay_names:
         _written(lambda: (folder / "replays").mkdir(exist_ok=True), which)
         taken = [int(name) for name, _ in site.store.replays(which)] + [

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from tdhil.config import STATED
-from tdhil.errors import LogUnopened
+from tdhil.errors import LogUnopened, MessageCode, UsageError
 from tdhil.fleet import ANNOTATIONS_FILE
 from tdhil.service.annotations import Annotations
 from tdhil.service.run_filter import NEWEST, SEARCHED_COLUMN, Order, RunFilter, Summary
@@ -195,6 +195,13 @@ class Store:
         if path is None or not path.is_dir():
             raise NotThere("this run does not exist", where=f"run {run[:40]}", next_step="See the list of runs")
         return path
+
+    def require_finished_log(self, run: str) -> None:
+        """Raise UsageError if the run has not ended, or has no log. Raises NotThere."""
+        if not (ended := self.status(run).ended) or not (self.place(run) / LOG).is_file():
+            raise UsageError("the run has no finished log", where=f"run {run}",
+                             next_step="The run ended without a log" if ended else "Wait until it has ended",
+                             entry=MessageCode.NOT_READY)
 
     def ids(self) -> list[str]:
         """Return all runs, the newest first."""

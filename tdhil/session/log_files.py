@@ -116,7 +116,7 @@ class LogPlace:
 
 def check_log_path(path: Path, where: str = OPTION["log"].flag) -> None:
     """Raise UsageError for a file that is not a log: it would be moved aside by mistake."""
-    from tdhil.recording import MAGIC
+    from tdhil.file_kind import MAGIC
 
     if not path.is_file() or path.suffix == ".mcap":
         return

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, LogError, MessageCode, NothingRecoverable, TdhilError, UsageError
-from tdhil.file_kind import require_log_kind
+from tdhil.file_kind import MAGIC, begins_like_log, require_log_kind
 
 if TYPE_CHECKING:
     import pandas
@@ -239,14 +239,12 @@ def require_file(path: Path) -> None:
 
 def is_log(path: Path) -> bool:
     """Recognise MCAP by its first bytes, also in a file that holds only some of them. Raises NothingRecoverable."""
-    from tdhil.recording import MAGIC
-
     try:
         with path.open("rb") as file:
             head = file.read(len(MAGIC))
     except OSError as error:
         raise NothingRecoverable(f"can't be read ({error.strerror or error})", where=str(path)) from error
-    return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
+    return begins_like_log(head)
 
 
 def _read_log(path: Path) -> RunRecord:

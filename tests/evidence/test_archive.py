@@ -24,7 +24,7 @@ from tdhil.evidence import (
 )
 from tdhil.evidence.archive import MEMBERS, LogFacts, archive_of, members_in, members_of, problems_of_members
 from tdhil.evidence.statement import PublisherStatement, ReferenceInertia, parts_in, serial_hmac
-from tdhil.recording import MAGIC
+from tdhil.file_kind import MAGIC
 from tdhil.recording.log_format import Event
 from tests.evidence.small_runs import RESULT, configuration, found, write_run
 

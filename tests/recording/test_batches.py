@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from drivers.drive import Command, Mode
 from tdhil.errors import LogError
+from tdhil.file_kind import MAGIC
 from tdhil.recording import chunk_table, log_reader
 from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, SAMPLE, STAGE, Event
 from tdhil.recording.log_messages import (
@@ -30,7 +31,6 @@ from tdhil.recording.log_messages import (
 )
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.mcap_container import LIBRARY
-from tdhil.recording.mcap_records import MAGIC
 from tdhil.recording.recording import Stage
 from tests.recording.log_runs import frames, make_run, same, same_run, sample
 

@@ -19,9 +19,9 @@ from mcap.records import Attachment, Chunk, DataEnd, Footer, Header, Metadata
 from mcap.writer import Writer
 
 from tdhil.errors import LogError
+from tdhil.file_kind import MAGIC
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.mcap_container import LIBRARY
-from tdhil.recording.mcap_records import MAGIC
 from tdhil.recording.mcap_recovery import Contents, walk
 from tests.recording.log_runs import make_run, same_run
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from profiles import MessageCode
 from tdhil.estimation.result import Refused
-from tdhil.estimation.samples import Samples
+from tdhil.estimation.samples import Samples, edges_of_runs
 from tdhil.recording import BoolArray, FloatArray
 
 _BLOCK_S, _BLOCK_SAMPLES = 0.1, 5    # s and samples; least length of a block over which signals are averaged
@@ -64,7 +64,7 @@ def refuse_faulty_signals(samples: Samples, speed_quantum: float, torque_quantum
         ("torque", "N·m", "acceleration", samples.torque_nm, torque_quantum, blocks.rate),
         ("speed", "rad/s", "torque", samples.speed_rad_s, speed_quantum, blocks.torque),
     ):
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(signal)) + 1, [len(signal)]])
+        edges = edges_of_runs(signal)
         counts = np.diff(edges)
         inner = (signal[edges[:-1]] > signal.min()) & (signal[edges[:-1]] < signal.max())
         for first in edges[:-1][inner & (counts >= _STUCK_RUNS * np.median(counts))].tolist():

@@ -12,7 +12,7 @@ import numpy as np
 
 from profiles import MessageCode
 from tdhil.estimation.result import Refused
-from tdhil.estimation.samples import Samples
+from tdhil.estimation.samples import Samples, edges_of_runs
 from tdhil.estimation.time_domain.windows import STILL_QUANTA
 
 _STILL_SHARE = 0.02       # of the highest speed: a lower speed counts as standstill
@@ -59,8 +59,7 @@ def find_stick_slip(samples: Samples, speed_quantum: float, torque_quantum: floa
     fastest = float(np.max(np.abs(speed)))
     still = np.abs(speed) <= max(_STILL_SHARE * fastest, STILL_QUANTA * speed_quantum)
     span = float(np.ptp(torque))
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(still)) + 1, [len(still)]])
-    parts = [(int(first), int(last)) for first, last in pairwise(edges)]
+    parts = [(int(first), int(last)) for first, last in pairwise(edges_of_runs(still))]
     between, rises = 0, []
     for (first, last), (_, after) in pairwise(parts):
         if not still[first] or first == 0 or last - first < _LEAST_SAMPLES:

@@ -31,6 +31,13 @@ REHEARSAL = {
 }
 
 
+def ended_run(served, rig="a", request=None):
+    """Start a run, wait for its end, and return its id."""
+    run = served.service.supervisor.start_run(rig, request or {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    return run
+
+
 @pytest.mark.heavy
 def test_a_page_with_a_text_that_is_not_saved_is_not_loaded_again(page, served):
     run = begin(served)
@@ -46,8 +53,7 @@ def test_a_page_with_a_text_that_is_not_saved_is_not_loaded_again(page, served):
 
 @pytest.mark.heavy
 def test_a_record_is_saved_once_by_a_double_click(page, served):
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     sent = []
     page.on("request", lambda asked: sent.append(asked.url) if asked.url.endswith("/annotations") else None)
     page.goto(f"/runs/{run}")
@@ -59,8 +65,7 @@ def test_a_record_is_saved_once_by_a_double_click(page, served):
 
 @pytest.mark.heavy
 def test_samples_that_are_made_first_show_their_progress(page, served, monkeypatch):
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     folder, goes_on = served.service.store.place(run), threading.Event()
     (folder / "run.mcap").write_bytes(b"log")
 
@@ -101,8 +106,7 @@ def test_a_form_takes_no_text_before_what_is_stored_is_in_it(page, path, label, 
 @pytest.mark.heavy
 def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatch):
     """After an edit or a signature, the page shows the progress and its time, and then the new report."""
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     wait_for("its end", lambda: not served.service.supervisor.live())
     folder = served.service.store.place(run)
     for name in ("report.html", "report.pdf"):
@@ -135,8 +139,7 @@ def test_a_report_that_is_made_again_shows_its_progress(page, served, monkeypatc
 
 
 def test_a_delayed_replay_shows_what_it_waits_for(page, served):
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     served.service.web.waiting_replays[run, "001"] = ReplayView("001", {}, now(), "local", "delayed", holder="run X")
     page.goto(f"/runs/{run}")
     row = page.locator("#replay-rows tr", has_text="waits until run X has ended")
@@ -147,8 +150,7 @@ def test_a_delayed_replay_shows_what_it_waits_for(page, served):
 
 
 def test_a_rehearsal_shows_the_required_and_observed_reaction_and_its_verdict(page, served):
-    run = served.service.supervisor.start_run("a", {"note": "done", "fault": ["torque-scale=1.1"]}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served, "a", {"note": "done", "fault": ["torque-scale=1.1"]})
     path = served.service.store.place(run) / "state.json"
     write_json(path, {**json.loads(path.read_bytes()), "rehearsal": REHEARSAL})
     page.goto(f"/runs/{run}")
@@ -164,8 +166,7 @@ def test_an_acceptance_shows_expected_and_identified_values_and_differences(page
     from tdhil.config import Expectation
     from tdhil.report import acceptance_of
 
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     path = served.service.store.place(run) / "result.json"
     result = json.loads(path.read_bytes()) | {"speed_lag_s": estimate(1.2), "viscous_nm_s_rad": estimate(8.0)}
     expected = [Expectation("inertia", 104.0, 10.4), Expectation("viscous", 8.0, 0.01),
@@ -186,8 +187,7 @@ def test_an_acceptance_shows_expected_and_identified_values_and_differences(page
 
 
 def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    ended_run(served)
     page.set_viewport_size({"width": 390, "height": 800})
     page.goto("/runs")
     for text in ("104.0 (100.0 to 108.0) kg·m²", "valid"):
@@ -196,8 +196,7 @@ def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
 
 
 def test_the_list_of_runs_names_a_rig_as_its_other_pages_do(page, served):
-    run = served.service.supervisor.start_run("hostile", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served, "hostile", {"note": "done"})
     page.goto("/runs")
     link = page.locator("#runs a")
     link.wait_for()
@@ -233,8 +232,7 @@ def test_the_list_of_runs_can_be_searched_and_sorted(page, served):
 def test_an_acceptance_that_fails_is_signed_with_a_remark_and_then_shows_who_signed(page, served):
     from tests.service.test_records import ACCEPTANCE
 
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     wait_for("its end", lambda: not served.service.supervisor.live())
     path = served.service.store.place(run) / "result.json"
     write_json(path, {**json.loads(path.read_bytes()), "acceptance": {**ACCEPTANCE, "verdict": "fail"}})
@@ -261,8 +259,7 @@ def test_numbers_of_a_result_have_the_digits_of_the_card(page, served):
     from tdhil.report.card import budget_figures
     from tdhil.report.intervals import with_interval
 
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     wait_for("its end", lambda: not served.service.supervisor.live())
     path = served.service.store.place(run) / "result.json"
     J = {"value": 1235.0, "low_total": 1222.2, "high_total": 1246.8, "low": 1222.2, "high": 1246.8}
@@ -299,8 +296,7 @@ def test_evidence_of_a_run_is_made_on_its_page(browser, served, monkeypatch, wid
 
     play_uploads(served.service, monkeypatch)
     monkeypatch.setattr("tdhil.evidence.making.make_evidence", partial(make_evidence, conclude=found))
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     wait_for("its end", lambda: not served.service.supervisor.live())
     log = served.service.store.place(run) / "run.mcap"
     log.unlink(missing_ok=True)
@@ -484,8 +480,7 @@ def test_a_stopped_run_is_compared_and_each_verdict_has_its_colour(page, served,
 
 
 def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     write(served.service.store.place(run) / "run.mcap")         # 0 to 1.99 s, speed 10 rad/s², torque -20 N·m/s
     page.goto(f"/runs/{run}/live")
     charts, readout = page.locator("#plot-speed .u-over, #plot-torque .u-over"), page.locator("#readout")
@@ -564,8 +559,7 @@ def test_the_recorded_motion_can_be_zoomed_read_and_exported(page, served):
 
 @pytest.mark.heavy
 def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypatch):
-    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
-    served.service.wait(run, "done")
+    run = ended_run(served)
     results(served, run, monkeypatch)
     page.goto(f"/runs/{run}")
     page.get_by_text("speed was quantised").wait_for()
