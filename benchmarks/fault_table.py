@@ -8,6 +8,7 @@ shaft, the log's fate, the exit code, and the tests. `--keep FILE` keeps what wa
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -17,6 +18,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tests.faults.rows import ROWS  # noqa: E402
+
+KILLED = (None, -signal.SIGKILL)       # a process that was killed has no code of its own
 
 HEAD = """# The faults, and what a run does about each
 
@@ -58,7 +61,7 @@ def table(lines):
         said = "<br>".join(dict.fromkeys(_cell(line["said"]) for line in found)) or _cell(row.said)
         rest = [line["standstill_s"] for line in found if line["standstill_s"] is not None]
         logs = ", ".join(dict.fromkeys(line["log"] for line in found if line["log"])) or "–"
-        codes = _codes([str(line["code"]) for line in found], row.codes)
+        codes = _codes([str(line["code"]) for line in found if line["code"] not in KILLED], row.codes)
         shown = "–" if not rest else f"{min(rest):.1f} s" if len(rest) == 1 else f"{min(rest):.1f} to {max(rest):.1f} s"
         out.append(f"| {number} | {row.fault} | {row.expected} | {said} | {shown} | {logs} | {codes} |")
         names = dict.fromkeys([*row.tests, *(line["test"].split("[")[0] for line in found)])
@@ -79,7 +82,8 @@ def with_row(text, new, number):
 
 def _codes(found, stated):
     """Return the codes of the row itself, if they hold all that was seen: another case may end otherwise."""
-    return stated if set(found) <= set(stated.split(", ")) else ", ".join(dict.fromkeys(found))
+    codes = stated if set(found) <= set(stated.split(", ")) else ", ".join(dict.fromkeys(found))
+    return "–" if codes == "-" else codes
 
 
 def _cell(text):

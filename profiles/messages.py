@@ -864,7 +864,8 @@ class MessageCode(Enum):
     # --- 12xx: rehearsal or acceptance not passed --------------------------------------------------------------------
     REHEARSAL_FAILED = (
         1200, "A rehearsed fault did not cause the required reaction",
-        "The run did not end as the fault table requires, or its interval misses the true inertia.",
+        "The run did not end as the fault table requires, or its interval misses the true inertia. Or the simulated"
+        " shaft was unsafe. It was too fast, was disabled while it turned, or was falsely reported at standstill.",
         "Compare the required reaction with what was seen. A weaker fault may stay below what tdhil detects.")
     ACCEPTANCE_FAILED = (
         1201, "An identified value contradicts the expected one",

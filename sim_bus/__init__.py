@@ -9,6 +9,10 @@ if TYPE_CHECKING:
     from sim_bus.command_arguments import printed_width as printed_width
     from sim_bus.fault_script import KnownFault as KnownFault, Scripted as Scripted
     from sim_bus.params import RigParams as RigParams
+    from sim_bus.shaft_judge import (
+        TURNING_RAD_S as TURNING_RAD_S, Judged as Judged, JudgedMachine as JudgedMachine,
+        ProcessOutcome as ProcessOutcome, TrueShaft as TrueShaft, judge as judge, read_shaft as read_shaft,
+    )
     from sim_bus.trace import check_trace_path as check_trace_path
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
@@ -16,5 +20,6 @@ else:
         "command_arguments": "printed_width",
         "fault_script": "KnownFault Scripted",
         "params": "RigParams",
+        "shaft_judge": "TURNING_RAD_S Judged JudgedMachine ProcessOutcome TrueShaft judge read_shaft",
         "trace": "check_trace_path",
     })

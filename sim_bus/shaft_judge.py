@@ -1,4 +1,4 @@
-"""Comparison of the true shaft's motion with the run's statements: five rules for a run with wrong reports. Pure.
+"""Comparison of the true shaft's motion with the run's statements: six rules for a run with faults. Pure.
 
 a  The host never disables a drive whose shaft turns. Exception: there is no string, the shaft accelerates against the
    quick stop or is as slow as in a sign probe, and the outcome states that the torque was removed.
@@ -8,6 +8,7 @@ c  An inertia that is `valid` or `valid_wide` has the true one in its total inte
    run by less than the least change that the run states it can show.
 d  The true speed stays below 1.1 times the limit, plus the effect of torque limit and friction in a reaction time.
 e  The process ends with a known exit code and a closed log.
+f  The shaft does not turn under torque at the end of the trace, after the drive has been alone.
 """
 
 from __future__ import annotations
@@ -78,6 +79,16 @@ class TrueShaft:
     def fastest_rad_s(self) -> float:
         """Largest magnitude of the speed, rad/s."""
         return float(np.abs(self.speed_rad_s).max(initial=0.0))
+
+    @property
+    def largest_torque_nm(self) -> float:
+        """Largest magnitude of the torque on the shaft, N·m."""
+        return float(np.abs(self.torque_nm).max(initial=0.0))
+
+    @property
+    def driven_rad_s(self) -> float:
+        """Magnitude of the speed at the end while the power stage is on, rad/s; else 0."""
+        return abs(float(self.speed_rad_s[-1])) if len(self.time_s) and self.enabled[-1] else 0.0
 
 
 _ON = {"operation enabled", "quick stop active", "fault reaction active"}
@@ -167,11 +178,14 @@ def judge(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine, *, 
         seen["c"] = (f"{outcome.verdict}: J in [{outcome.low_total:.4g}, {outcome.high_total:.4g}], "
                      f"true {machine.inertia_kg_m2:g}")
     beyond = shaft.fastest_rad_s - SPEED_SHARE * machine.speed_max_rad_s
-    used_s = max(0.0, beyond) * machine.inertia_kg_m2 / (machine.torque_nm + machine.coulomb_nm)
+    used_s = 0.0 if beyond <= 0.0 else beyond * machine.inertia_kg_m2 / (machine.torque_nm + machine.coulomb_nm)
     if used_s > reaction_s or not isfinite(used_s):
-        seen["d"] = f"{shaft.fastest_rad_s:.2f} rad/s, limit {machine.speed_max_rad_s:g}: reaction {used_s:.2f} s"
+        seen["d"] = (f"it reached {shaft.fastest_rad_s:.2f} rad/s, the limit is {machine.speed_max_rad_s:g} rad/s: the"
+                     f" torque acted for {used_s:.2f} s")
     if outcome.code not in EXIT_CODES or not outcome.log_closed:
         seen["e"] = f"exit {outcome.code}, log {'closed' if outcome.log_closed else 'not closed'}"
+    if shaft.driven_rad_s > TURNING_RAD_S:
+        seen["f"] = f"it still turned under torque at the end, at {shaft.driven_rad_s:.2f} rad/s"
     return Judged({rule: text for rule, text in seen.items() if rule not in not_asked},
                   {rule: text for rule, text in seen.items() if rule in not_asked}, used_s, shaft.fastest_rad_s)
 
@@ -190,7 +204,7 @@ def _disabled(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine)
     slow = speed <= PROBE_SHARE * machine.speed_max_rad_s and not machine.string
     if (accelerated or slow) and outcome.removed and (beyond or not machine.string):
         return ""
-    return f"disabled at {speed:.2f} rad/s, {at_s:.2f} s" + ", accelerating" * accelerated
+    return f"the drive was disabled at {speed:.2f} rad/s, {at_s:.2f} s" + ", while it accelerated" * accelerated
 
 
 def _at_rest(shaft: TrueShaft, outcome: ProcessOutcome) -> str:
@@ -199,4 +213,4 @@ def _at_rest(shaft: TrueShaft, outcome: ProcessOutcome) -> str:
     disabled_s = () if outcome.removed else shaft.disabled_s[-1:]
     moments = [one for one in (outcome.seen_s, *disabled_s) if one is not None]
     speed = max((shaft.speed_at(at_s) for at_s in moments), default=0.0)
-    return f"reported at rest at {speed:.2f} rad/s" if speed > TURNING_RAD_S else ""
+    return f"standstill was reported at {speed:.2f} rad/s" if speed > TURNING_RAD_S else ""

@@ -178,6 +178,7 @@ class StopReport:
     trapped_nm: float = 0.0            # torque of a drill string at standstill, before its release; signed
     stayed_in_torque_mode: bool = False    # speed mode was needed for the stop, and not confirmed
     beside: tuple[str, ...] = ()       # errors of log, observer and display meanwhile, each once
+    torque_removed: bool = False       # the drive was disabled before the shaft was seen at standstill
 
 
 class StopSequence:
@@ -276,7 +277,7 @@ class StopSequence:
 
     def _ended(self, confirmed: bool, at_rest_s: float | None, disabled: bool) -> StopReport:
         return StopReport(confirmed, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm,
-                          self._stayed_in_torque_mode, tuple(self._loop.stop_side_troubles))
+                          self._stayed_in_torque_mode, tuple(self._loop.stop_side_troubles), self._torque_removed)
 
     # -- with a drill string -----------------------------------------------------------------------------------
 

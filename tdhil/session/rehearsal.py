@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +17,7 @@ from profiles import MessageCode, with_code
 from tdhil.errors import ExitCode, exit_code
 
 if TYPE_CHECKING:
-    from sim_bus import KnownFault, Scripted
+    from sim_bus import Judged, KnownFault, Scripted, TrueShaft
     from tdhil.buses import PeerPlan
     from tdhil.runner import RunOutcome
 
@@ -204,12 +204,14 @@ def _row(fault: Scripted, kinds: Mapping[str, KnownFault]) -> int:
 
 def judge_rehearsal(
     peer: PeerPlan, drive: str, outcome: RunOutcome, document: Mapping[str, Any] | None = None,
-    own_code: int | None = None, *, other_program: bool = False,
+    own_code: int | None = None, *, other_program: bool = False, shaft: TrueShaft | None = None,
+    speed_max_rad_s: float = math.inf,
 ) -> Rehearsal:
     """Return the verdict on the faults of this run.
 
     ``document``: the result, None if the run ended early; ``own_code``: exit code of the result; ``other_program``:
-    the run has a virtual string or measures the drive's impedance.
+    the run has a virtual string or measures the drive's impedance; ``shaft``: motion of the simulated shaft, None
+    without a trace; ``speed_max_rad_s``: speed limit of the run.
     """
     from tdhil.buses import bus_named
 
@@ -230,11 +232,13 @@ def judge_rehearsal(
     short = any(math.isfinite(one.duration_s) for one in triggered)
     if short or 0 in allowed or any(one.or_covered for one in required):
         allowed |= {0, 9}                  # a result, or the statement that there is none
-    passed = code in allowed and covered is not False
+    moved = None if shaft is None else _judge_shaft(peer, outcome, shaft, code, speed_max_rad_s)
+    unsafe = moved is not None and bool(moved.broken)
+    passed = code in allowed and covered is not False and not unsafe
     judged = tuple(
         RehearsedFault(
             one.text, row, REQUIRED.get(row, ANY_FAULT).words, REQUIRED.get(row, ANY_FAULT).codes,
-            RehearsalVerdict.INCONCLUSIVE if by_hand or one.text in peer.never_came
+            RehearsalVerdict.INCONCLUSIVE if (by_hand and not unsafe) or one.text in peer.never_came
             else RehearsalVerdict.PASS if passed else RehearsalVerdict.FAIL,
         ) for one in peer.faults for row in (_row(one, kinds),)
     )
@@ -242,7 +246,45 @@ def judge_rehearsal(
     worst = next(one for one in (RehearsalVerdict.FAIL, RehearsalVerdict.INCONCLUSIVE, RehearsalVerdict.PASS)
                  if one in found)
     never = f". Not triggered: {', '.join(peer.never_came)}" if peer.never_came else ""
-    return Rehearsal(worst, _seen(outcome, document, code, truth, covered) + never, judged)
+    seen = _seen(outcome, document, code, truth, covered)
+    if shaft is not None and moved is not None:
+        seen += _shaft_seen(shaft, moved)
+    return Rehearsal(worst, seen + never, judged)
+
+
+_OF_THE_SHAFT = frozenset("abdf")
+"""Rules of `sim_bus.shaft_judge` on the motion of the shaft. The other two are on the result and the process."""
+
+
+def _judge_shaft(
+    peer: PeerPlan, outcome: RunOutcome, shaft: TrueShaft, code: int, speed_max_rad_s: float
+) -> Judged:
+    """Return the rules that the simulated shaft broke."""
+    from sim_bus import JudgedMachine, ProcessOutcome, judge
+
+    stop, plant = outcome.stop, peer.plant.plant
+    machine = JudgedMachine(
+        plant.inertia_kg_m2 + plant.added_inertia_kg_m2, 0.0, shaft.largest_torque_nm, speed_max_rad_s,
+        string=plant.kind == "string",
+    )
+    # In real time the host's clock is not that of the simulation.
+    seen_s = stop.at_rest_s if stop is not None and peer.stepped else None
+    ended = ProcessOutcome(
+        code, stop is not None and stop.confirmed, seen_s, None, -math.inf, math.inf,
+        removed=stop is not None and stop.torque_removed, log_closed=True,
+    )
+    found = judge(shaft, ended, machine)
+    return replace(found, broken={rule: text for rule, text in found.broken.items() if rule in _OF_THE_SHAFT})
+
+
+def _shaft_seen(shaft: TrueShaft, moved: Judged) -> str:
+    """Return the motion of the simulated shaft, as it continues the line of `_seen`."""
+    from sim_bus import TURNING_RAD_S
+
+    if moved.broken:
+        return f"; UNSAFE, the simulated shaft: {'; '.join(moved.broken.values())}"
+    ended = "stood still" if shaft.speed_at(math.inf) <= TURNING_RAD_S else "turned without torque"
+    return f"; the simulated shaft reached {moved.fastest_rad_s:.2f} rad/s and {ended} at the end"
 
 
 def _code(outcome: RunOutcome) -> int:

@@ -7,12 +7,14 @@ The command line and the Python API both use it, so that guard, stop and confirm
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -44,6 +46,7 @@ from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from drivers import Identity, Preflight
+    from sim_bus import TrueShaft
     from tdhil.session.conclusion import Conclusion
     from tdhil.session.evaluation import EvaluationConclusion
     from tdhil.session.verification import VerificationConclusion
@@ -122,6 +125,7 @@ class RunSession:
             operator_interface.warn(f"another run writes {place.wanted}: the log of this run is {place.path}")
         self._older_shown = False
         self._outcome: RunOutcome | None = None
+        self._shaft: TrueShaft | None = None       # motion of the simulated shaft of a rehearsal
         self.rehearsal: Rehearsal | None = None
         """Verdict on the rehearsed faults, once the run has ended; None without faults."""
         self.log = RunLog(writer, configuration(request) | dict(request.stated))
@@ -154,9 +158,8 @@ class RunSession:
     def _move(self, stop: StopRequest | None) -> RunOutcome:
         request, log, operator_interface = self._request, self.log, self._operator_interface
         options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
-        trace = None if options.trace is None else Path(options.trace)
         data = rig.drive_data if rig is not None else None
-        with stop_on_signals(stop) as stop_request, opened_drive(
+        with self._traced() as trace, stop_on_signals(stop) as stop_request, opened_drive(
             peer, options, connection, data, log.frame, trace
         ) as drive, operator_interface.watch() as display, real_time_priority(
             request.real_time_priority, stepped=peer.stepped
@@ -183,6 +186,24 @@ class RunSession:
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} was not triggered")
             operator_interface.warn(f"tdhil: --fault {fault} was not triggered: the run ended before its time")
         return outcome
+
+    @contextmanager
+    def _traced(self) -> Iterator[Path | None]:
+        """Yield the file of the simulated shaft's motion. A rehearsal has one also without --trace, and reads it at
+        the end.
+        """
+        wanted, rehearsed = self._request.options.trace, bool(self._request.peer.faults)
+        with ExitStack() as stack:
+            path = None if wanted is None else Path(wanted)
+            if path is None and rehearsed:
+                path = Path(stack.enter_context(TemporaryDirectory(prefix="tdhil-"))) / "shaft.csv"
+            try:
+                yield path
+            finally:
+                if path is not None and rehearsed and path.is_file():
+                    from sim_bus import read_shaft
+
+                    self._shaft = read_shaft(path)
 
     def _identify(self) -> Identify:
         """Return the function that identifies the recording during the run, as `conclude` does at its end."""
@@ -217,8 +238,10 @@ class RunSession:
         if not request.peer.faults or outcome is None:
             return
         other = request.case is not None or request.options.impedance
-        self.rehearsal = judge_rehearsal(request.peer, request.connection.drive, outcome, document, code,
-                                         other_program=bool(other))
+        bench = self.log.run.get("bench")
+        self.rehearsal = judge_rehearsal(
+            request.peer, request.connection.drive, outcome, document, code, other_program=bool(other),
+            shaft=self._shaft, speed_max_rad_s=math.inf if bench is None else bench["limits"]["speed_max_rad_s"])
         with suppress(LogError):
             self.log.configure(rehearsal=self.rehearsal.plain())
 

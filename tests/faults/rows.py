@@ -134,7 +134,7 @@ FIFTY = {
     46: Row("truncated, bit-flipped or bomb MCAP", "partial replay, memory capped", "3, 10",
             ("tests/recording/test_damage.py::test_flipped_bits", "tests/recording/test_damage.py::test_cut_anywhere",
              "tests/recording/test_damage.py::test_a_bomb_is_refused_in_little_memory"),
-            "what is whole is read, at most a chunk is lost for each wrong byte; a bomb is refused"),
+            "each intact chunk is read; a wrong byte loses at most one chunk; a bomb is refused"),
     47: Row("YAML: duplicate or unknown key, tag, 1e3, on/off, 010", "2, with the line", "2",
             ("tests/profiles/test_strict_yaml.py::test_what_is_refused",), "one line each, with file and line"),
     48: Row("flat, unexcited or saturated data", "not identifiable and why", "9",

@@ -1,10 +1,12 @@
 """Verdict of a rehearsed fault: required reaction, observed reaction, pass or fail, and exit code."""
 
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from sim_bus import RigParams
+from sim_bus import RigParams, TrueShaft
 from tdhil.buses import PeerPlan, bus_named
 from tdhil.errors import DriveFault, ExitCode, Interrupted, LimitHit, exit_code
 from tdhil.recording import Stage
@@ -24,10 +26,39 @@ HOLDS, MISSES = (
 )
 
 
-def judged(*faults, cause=None, stop=STOPPED, document=None, code=None, never=()):
+def judged(*faults, cause=None, stop=STOPPED, document=None, code=None, never=(), shaft=None):
     bus = bus_named("canopen")
     peer = PeerPlan(True, True, 1, RigParams(), bus.parse_faults(faults), never_came=list(never))
-    return judge_rehearsal(peer, "canopen", RunOutcome(STAGES, cause, stop, None), document, code)
+    return judge_rehearsal(peer, "canopen", RunOutcome(STAGES, cause, stop, None), document, code, shaft=shaft,
+                           speed_max_rad_s=10.0)
+
+
+def shaft(speeds, *, on_until_s, disabled_s=()):
+    """Return a simulated shaft with the speed interpolated between (time, speed), every 10 ms up to 20 s."""
+    time_s = np.arange(0.0, 20.0, 0.01)
+    speed = np.interp(time_s, [t for t, _ in speeds], [w for _, w in speeds])
+    return TrueShaft(time_s, speed, np.full_like(time_s, 400.0), time_s < on_until_s, disabled_s, stop_s=5.0)
+
+
+REST = replace(STOPPED, at_rest_s=14.5)
+COASTS = [(0, 0), (4, 4), (7, 4), (14, 0)]
+
+
+@pytest.mark.parametrize(("motion", "stop", "verdict", "seen"), [
+    (shaft(COASTS, on_until_s=15, disabled_s=(15.0,)), REST, "pass", "reached 4.00 rad/s and stood still at the end"),
+    (shaft(COASTS, on_until_s=7, disabled_s=(7.0,)), LOST, "fail",
+     "UNSAFE, the simulated shaft: the drive was disabled at 4.00 rad/s"),
+    (shaft([(0, 4), (20, 4)], on_until_s=99), LOST, "fail", "still turned under torque at the end, at 4.00 rad/s"),
+    (shaft([(0, 4), (20, 4)], on_until_s=3), LOST, "pass", "turned without torque at the end"),
+    (shaft([(0, 4), (10, 42), (20, 42)], on_until_s=5, disabled_s=(12.0,)), replace(LOST, torque_removed=True), "fail",
+     "reached 42.00 rad/s, the limit is 10 rad/s"),
+    (shaft([(0, 4), (9, 4), (14, 0)], on_until_s=15), STOPPED, "fail", "standstill was reported at 4.00 rad/s"),
+])
+def test_a_rehearsal_is_compared_with_the_simulated_shaft(motion, stop, verdict, seen):
+    rehearsal = judged("sensor-lost@speed+3s", cause=LimitHit("reports contradict each other"), stop=stop, shaft=motion)
+    assert (rehearsal.verdict, rehearsal.faults[0].verdict) == (verdict, verdict) and seen in rehearsal.seen
+    by_hand = judged("sensor-lost@speed+3s", cause=Interrupted(2), stop=stop, code=130, shaft=motion)
+    assert by_hand.verdict == ("fail" if verdict == "fail" else "inconclusive")
 
 
 @pytest.mark.parametrize(("fault", "found", "verdict", "code"), [

@@ -1,5 +1,7 @@
 """Judge of a run with false reports: each rule on traces made by hand, and the set of runs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,7 @@ def shaft(speeds, *, disabled_s=(20.0,), stop_s=10.0):
 TURNED = shaft([(0, 0), (5, 8), (10, 8), (14, 0), (30, 0)])
 COASTS = shaft([(0, 0), (5, 8), (10, 8), (14, 3), (30, 3)])
 RUNS_AWAY = shaft([(0, 0), (5, 8), (10, 8), (20, 12), (30, 12)])
+STAYS_ON = replace(shaft([(0, 0), (5, 8), (30, 8)], disabled_s=()), enabled=np.ones(3000, dtype=bool))
 
 
 def otherwise(**changes):
@@ -48,6 +51,7 @@ def otherwise(**changes):
     (shaft([(0, 0), (5, 14.9), (14, 0)]), FINE, RIG, ""),
     (shaft([(0, 0), (5, -15.1), (14, 0)]), FINE, RIG, "d"),
     (TURNED, otherwise(code=1), RIG, "e"),
+    (STAYS_ON, otherwise(code=8, at_rest=False, seen_s=None), RIG, "f"),
     (TURNED, otherwise(log_closed=False), RIG, "e"),
 ])
 def test_each_rule(turned, outcome, rig, rules):
