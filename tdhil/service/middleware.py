@@ -24,6 +24,7 @@ from tdhil.service.access import token_in
 from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import (
     Conflict,
+    FolderMissing,
     NoRoom,
     NotAllowed,
     NotLoggedIn,
@@ -117,8 +118,8 @@ def status_of(error: BaseException) -> int:
     for kind, status in (
         (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
         (TooLarge, 413), (TooSlow, 408), (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422),
-        (CsvMisnamed, 422), (CsvUnusable, 422), (NotReacting, 504), (CommunicationLost, 503), (NoRoom, 507),
-        (LogError, 503),
+        (CsvMisnamed, 422), (CsvUnusable, 422), (NotReacting, 504), (FolderMissing, 504),
+        (CommunicationLost, 503), (NoRoom, 507), (LogError, 503),
     ):
         if isinstance(error, kind):
             return status

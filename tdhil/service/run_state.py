@@ -266,7 +266,7 @@ def iso(time_s: float) -> str:
 #     │   └── TooLarge                the uploaded file is larger than the limit                exit 2, HTTP 413
 #     ├── CommunicationLost
 #     │   ├── NotReacting             the run's process is suspended                            exit 5, HTTP 504
-#     │   ├── FolderMissing           the run's folder is missing; its process was signalled    exit 5, HTTP 503
+#     │   ├── FolderMissing           the run's folder is missing; its process was signalled    exit 5, HTTP 504
 #     │   └── TooSlow                 an upload takes too long                                  exit 5, HTTP 408
 #     └── PreflightRefused
 #         └── Conflict                another run uses the rig; the code is void                exit 4, HTTP 409

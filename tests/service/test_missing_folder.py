@@ -44,7 +44,7 @@ def test_the_process_is_stopped_and_the_rig_is_busy_until_it_has_ended(service, 
 
 
 def test_a_stop_over_http_reaches_such_a_run(client, call, service, tmp_path):
-    for path, expect in (("/rigs/a/stop", 200), ("/runs/{run}/stop", 503)):
+    for path, expect in (("/rigs/a/stop", 200), ("/runs/{run}/stop", 504)):
         run = without_folder(service, tmp_path / str(expect)) if (tmp_path / str(expect)).mkdir() is None else ""
         assert call("GET", "/rigs/a", 200)["state"] == "busy"
         found = call("POST", path.format(run=run), expect, json={})

@@ -70,7 +70,7 @@
       });
       const found = await answer.json();
       if (answer.status === 401 && document.body.dataset.page !== "login") loggedOut();
-      if (!answer.ok) throw Object.assign(new Refused(found.error ? errorText(found.error) : `HTTP ${answer.status}`), { fields: found.fields || [] });
+      if (!answer.ok) throw Object.assign(new Refused(found.error ? errorText(found.error) : `HTTP ${answer.status}`), { fields: found.fields || [], status: answer.status });
       return found;
     } finally {
       clearTimeout(timer);
@@ -624,7 +624,7 @@
   function livePage() {
     const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
-    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null, tooLate = false;
+    let status = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = "", unseen = null, tooLate = false;
     let wentOn = false;                                // true if the page was opened for the run, not for its record
     try { wentOn = sessionStorage.getItem(STARTED) === run; } catch (error) { /* then a run that ended at once is not followed */ }
     const charts = window.tdhil.motion(run);
@@ -761,11 +761,11 @@
     /** The stop is not acknowledged; or the run acknowledged it, and its drive does not react. */
     function stopAlarm() {
       const stop = (status && status.stop) || {}, over = status && ENDED.includes(status.state);
-      if (stop.asked || stop.at_rest || over) undelivered = false;
+      if (stop.asked || stop.at_rest || over) undelivered = "";
       const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
       unseen = waits ? unseen || Date.now() : null;
       if (saidOfRig) return;                  // the result of a stop after the run stays
-      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? tr("NO REPLY FROM THE DRIVE: use the hard-wired emergency stop") : "";
+      const text = undelivered || (unseen && Date.now() - unseen > SILENT_MS ? tr("NO REPLY FROM THE DRIVE: use the hard-wired emergency stop") : "");
       byId("undelivered").hidden = !text;
       if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
     }
@@ -783,13 +783,13 @@
       if (status && ENDED.includes(status.state)) { await stopRig({ id: status.rig, name: status.rig_name || status.rig }, ofRig); return; }      // the run is over, its shaft may still turn
       asking = Date.now();
       stopTimes();
-      const late = setTimeout(() => { undelivered = true; stopAlarm(); }, SILENT_MS);
+      const late = setTimeout(() => { undelivered = UNDELIVERED; stopAlarm(); }, SILENT_MS);
       try {
         const found = await call("POST", `/runs/${run}/stop`, {}, {}, 10000);
         tooLate = Boolean(found.stop.at_rest && !found.stop.asked);
         if (found.stop.asked || tooLate || found.state === "requested" || ENDED.includes(found.state)) {
           clearTimeout(late);
-          undelivered = false;
+          undelivered = "";
         }
         if (status) {              // the socket may have newer data: a late answer must not replace them
           const stop = Object.fromEntries(Object.entries(found.stop).map(([name, value]) => [name, value ?? status.stop[name]]));
@@ -798,7 +798,9 @@
           state();
         }
       } catch (error) {
-        undelivered = true;
+        clearTimeout(late);
+        // with 504 the run's process was ended, and the message states what to check
+        undelivered = !(error instanceof Refused) ? UNDELIVERED : error.status === 504 ? error.message : `${UNDELIVERED}. ${error.message}`;
       } finally {
         asking = null;
         stopTimes();

@@ -197,6 +197,17 @@ def test_a_stop_without_a_reply_is_reported(page, served, way):
     assert served.service.store.status(run).stop.asked is None
 
 
+@pytest.mark.heavy
+def test_the_stop_of_a_run_without_its_folder_states_that_it_was_signalled(page, served, tmp_path):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text="moving").wait_for()
+    served.service.store.place(run).rename(tmp_path / "moved")
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.get_by_text("SIGTERM was sent to its process").wait_for()
+    assert not page.get_by_text("NOT DELIVERED").is_visible()
+
+
 def test_the_time_left_of_a_simulated_run_is_in_real_time(page, served):
     """Ten seconds of a stepped run take one second, so 60 s of it take 6 s."""
     run, sockets = begin(served), []
