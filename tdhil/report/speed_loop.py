@@ -86,6 +86,8 @@ class LoopTunedFor:
     """Lag of the reported speed, for tune verify; None: unknown."""
     rehearsed_faults: tuple[str, ...] = ()
     """Faults that were scripted in the run."""
+    coulomb_nm: Range | None = None
+    """Coulomb friction, for the plan of tune verify; None: unknown."""
 
 
 def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def plan_dry_steps(
 ) -> tuple[StepProgram, MachineLimits]:
     """Return the largest steps of a verification, and the machine's limits. Raises an error if they do not fit.
 
-    Friction and the resolution of the reported speed are not known before the run.
+    Friction is that of the tuning. The resolution of the reported speed is not known before the run.
     """
     from tdhil.runner import plan_steps_before
 

@@ -46,6 +46,7 @@ def load_step_case(path: Path, use: str) -> StepCase:
             "kind": use, "plant": tuning["plant"], "gains": chosen,
             **{name: chosen[name] for name in ("overshoot_share", "rise_s", "settling_s")},
             "reported_lag_s": tuning["reported_speed_lag_s"], "source": str(path),
+            "coulomb_nm": tuning["plant"].get("coulomb_nm"),
         })
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UsageError(f"is not a tuning that tdhil tune speed wrote ({type(error).__name__}: {error})",

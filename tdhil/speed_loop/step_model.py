@@ -63,6 +63,8 @@ class StepCase:
     """Time constant of the reported speed."""
     source: str = ""
     """File of the tuning."""
+    coulomb_nm: Range | None = None
+    """Coulomb friction T_c; None: unknown."""
     motion: ClassVar[str] = "small steps of the set speed"     # of stage 5, for the confirmation
 
     @property
@@ -74,6 +76,11 @@ class StepCase:
     def torque_offset(self) -> bool:
         """Return whether stage 5 writes the drive's torque offset."""
         return False
+
+    def friction_nm(self, speed_rad_s: float) -> float:
+        """Return the steady torque T_c + B ω of the best estimate; only B ω if T_c is unknown."""
+        coulomb_nm = 0.0 if self.coulomb_nm is None else self.coulomb_nm.value
+        return coulomb_nm + self.plant.viscous_nm_s_rad.value * speed_rad_s
 
     def plain(self) -> dict[str, Any]:
         """Return the case as plain data for the log; `step_case_of` reads it."""
@@ -98,7 +105,9 @@ def step_case_of(plain: Mapping[str, Any]) -> StepCase:
                       "hertz", "numerator_damping", "denominator_damping"))))
     overshoot, rise, settling, lag = (
         ranged(plain[name]) for name in ("overshoot_share", "rise_s", "settling_s", "reported_lag_s"))
-    return StepCase(str(plain["kind"]), plant, law, overshoot, rise, settling, lag, str(plain.get("source", "")))
+    coulomb = plain.get("coulomb_nm")
+    return StepCase(str(plain["kind"]), plant, law, overshoot, rise, settling, lag, str(plain.get("source", "")),
+                    None if coulomb is None else ranged(coulomb))
 
 
 @dataclass(frozen=True)

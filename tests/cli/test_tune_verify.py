@@ -24,7 +24,7 @@ def tuned(tmp_path, capsys):
     found, path = tmp_path / "result.json", tmp_path / "tune.json"
     found.write_text(json.dumps(result(
         gear_ratio=1.0, inertia_kg_m2=estimate(104.0, 100.0, 108.0), viscous_nm_s_rad=estimate(8.0, 7.6, 8.4),
-        frequency_response=None)), encoding="utf-8")
+        coulomb_nm=estimate(60.0, 58.0, 62.0), frequency_response=None)), encoding="utf-8")
     assert main(["tune", "speed", str(found), "--inner-lags", "20ms", "10ms", "--dead-time", "2ms", "--bandwidth",
                  "2", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -44,6 +44,18 @@ def test_the_plan_stays_within_the_limits_and_moves_nothing(tuned, capsys, monke
     text = capsys.readouterr().out
     assert text.startswith("DRY RUN: nothing is connected, nothing moves\nSIMULATED")
     assert max(map(len, text.splitlines())) <= 80 and f"{plan['pairs']} pairs of steps" in text
+
+
+def test_a_torque_limit_below_the_friction_of_the_tuning_is_refused_before_motion(tuned, capsys, tmp_path):
+    """T_c + B ω = 60 + 8 · 7.15 = 117 N·m: the guard ended such a run after 42 s of motion."""
+    document, path = tuned
+    assert document["plant"]["coulomb_nm"]["value"] == 60.0
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 90, time_s: 900, "
+                   "quick_stop_rad_s2: 2.0, watchdog_s: 0.5, probe_torque_nm: 80, probe_travel_rad: 3.0}\n")
+    assert main(["tune", "verify", str(path), "--rig", str(rig), "--simulate", "--dry-run"]) == 4
+    said = " ".join(capsys.readouterr().err.split())
+    assert "rotation at 7.15 rad/s needs 117.2 N·m against friction, and the torque limit is 90 N·m" in said
 
 
 @pytest.mark.parametrize(("content", "said"), [

@@ -95,14 +95,19 @@ def test_an_error_of_the_comparison_does_not_end_the_run(world, monkeypatch):
                for _, text in log.events)
 
 
-@pytest.mark.parametrize(("limits", "said"), [
-    (replace(LIMITS, load="string", torque_ramp_nm_s=50.0), "load is string"),
-    (replace(LIMITS, time_s=130.0), "the time limit leaves 10 s"),
-    (replace(LIMITS, torque_nm=15.0, probe_torque_nm=15.0), "one count of the reported speed is 0.01"),
-], ids=["string", "time", "counts"])
-def test_what_can_not_be_is_refused_before_anything_moves(world, limits, said):
+NO_FRICTION = replace(CASE, plant=replace(PLANT, viscous_nm_s_rad=Range(0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(("limits", "case", "said"), [
+    (replace(LIMITS, load="string", torque_ramp_nm_s=50.0), CASE, "load is string"),
+    (replace(LIMITS, time_s=130.0), CASE, "the time limit leaves 10 s"),
+    (replace(LIMITS, torque_nm=15.0, probe_torque_nm=15.0), NO_FRICTION, "one count of the reported speed is 0.01"),
+    (replace(LIMITS, torque_nm=90.0), replace(CASE, coulomb_nm=Range(60.0, 58.0, 62.0)),
+     "needs 117.2 N·m against friction, and the torque limit is 90 N·m"),
+], ids=["string", "time", "counts", "friction"])
+def test_what_can_not_be_is_refused_before_anything_moves(world, limits, case, said):
     here = world(FakeDrive(), limits)
-    result = runner(here, limits=limits).run()
+    result = runner(here, case, limits).run()
     assert isinstance(result.cause, PreflightRefused) and said in str(result.cause)
     assert result.stop is None and here.drive.speed == 0.0 and here.drive.closed
 

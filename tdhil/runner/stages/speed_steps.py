@@ -12,6 +12,7 @@ from profiles import MessageCode
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import MachineLimits
+from tdhil.runner.stages.speed import mean_speeds
 from tdhil.speed_loop import LEAST_PAIRS, StepCase, StepProgram, StepVerification, step_length_s
 
 FEWEST_PAIRS, MOST_PAIRS, PAIRS_S = 24, 60, 160.0
@@ -72,8 +73,19 @@ def plan_steps(
 def plan_steps_before(
     case: StepCase, limits: MachineLimits, period_s: float, resolution_rad_s: float
 ) -> StepProgram:
-    """Return the largest steps that the limits permit, before motion. Raises PreflightRefused if none fit."""
-    return plan_steps(case, limits, period_s, resolution_rad_s, limits.time_s - BEFORE_S - STEPS_RESERVE_S)
+    """Return the largest steps that the limits permit, before motion. Raises PreflightRefused if none fit, or if
+    friction exceeds the torque limit.
+    """
+    fastest = mean_speeds(limits)[1]
+    friction_nm = case.friction_nm(fastest)
+    if friction_nm >= limits.torque_nm:
+        raise _refused(
+            f"steady rotation at {fastest:.3g} rad/s needs {friction_nm:.4g} N·m against friction, and the torque "
+            f"limit is {limits.torque_nm:.4g} N·m", "limits in rig.yaml",
+            "Raise limits.torque_nm within the machine's limits, or lower limits.speed_max_rad_s")
+    middle = 0.5 * (limits.speed_min_rad_s + limits.speed_max_rad_s)
+    return plan_steps(case, limits, period_s, resolution_rad_s, limits.time_s - BEFORE_S - STEPS_RESERVE_S,
+                      case.friction_nm(middle))
 
 
 def refuse_other_shaft(case: StepCase, model: RigGuess) -> None:
