@@ -71,8 +71,10 @@ class CommandParser(argparse.ArgumentParser):
             from tdhil.cli.arguments import meant
 
             actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
-            if not args or args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
-                word = args[0] if args else "-"
+            if all(word == "--json" for word in args):
+                raise self._refusal(f"an action is missing: {', '.join(actions.choices)}", MessageCode.USAGE)
+            if args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
+                word = args[0]
                 # the default action would take a misspelt action as a file
                 if not word.startswith("-") and (
                         hint := meant(self.also_called.get(word, word), actions.choices)) and not Path(word).exists():

@@ -650,6 +650,13 @@ def test_the_old_call_means_soft_torque(tmp_path, capsys):
     assert "speed|verify|soft-torque" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_tune_without_a_word_lists_its_actions(words, capsys):
+    """It named the arguments of soft-torque, which the user did not write."""
+    assert main(["tune", *words]) == 2
+    assert "tune: an action is missing: speed, verify, soft-torque." in capsys.readouterr().err
+
+
 def noisy(tmp_path, noise, why=None):
     path = tmp_path / "severity.json"
     path.write_text(json.dumps({"kind": "severity", "records": [{"bit_noise": noise, "bit_noise_refused": why}]}))
