@@ -40,11 +40,18 @@ def part_with_interval(part: Mapping[str, Any], unit: str) -> str:
 
 
 def table_cell(part: Mapping[str, Any], times: float = 1.0) -> str:
-    """Return ``2.31 (2.22 to 2.42)`` without a unit, the value alone where it is exact, a dash where it is None."""
+    """Return ``2.31 (2.22 to 2.42)`` without a unit, the value alone where it is exact or without an interval, a dash
+    where it is None.
+    """
     value, low, high = (None if part[name] is None else times * part[name] for name in ("value", "low", "high"))
     if value is None:
         return "–"
-    return f"{value:.4g}" if low == high else "{} ({} to {})".format(*rounded(value, low, high))
+    if low == high:
+        return f"{value:.4g}"
+    middle, below, above = rounded(value, low, high)
+    if low is None or high is None:
+        return f"{middle} (no lower limit, to {above})" if low is None else f"{middle} (from {below}, no upper limit)"
+    return f"{middle} ({below} to {above})"
 
 
 def rounded(value: float | None, low: float | None, high: float | None, more: int = 0) -> tuple[str, str, str]:

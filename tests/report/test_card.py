@@ -112,7 +112,9 @@ def test_a_cell_of_a_table_rounds_its_interval_outwards_and_writes_no_powers_of_
     assert table_cell({"value": 1603.4, "low": 1204.0, "high": 2003.0}) == "1600 (1200 to 2010)"
     assert table_cell({"value": 0.293, "low": 0.253, "high": 0.341}, 100.0) == "29.3 (25.3 to 34.1)"
     assert table_cell({"value": 1603.4, "low": 1603.4, "high": 1603.4}) == "1603"
-    assert table_cell({"value": 2.4, "low": 2.29, "high": None}) == "2.4 (2.29 to open)"
+    assert table_cell({"value": 2.4, "low": 2.29, "high": None}) == "2.4 (from 2.29, no upper limit)"
+    assert table_cell({"value": 2.4, "low": None, "high": 2.5}) == "2.4 (no lower limit, to 2.5)"
+    assert table_cell({"value": 2.4, "low": None, "high": None}) == "2.4"
     assert table_cell({"value": None, "low": None, "high": None}) == "–"
 
 
