@@ -62,9 +62,9 @@ GRAPHS = {
         "periods)"),
     "open_loop": Graph(
         "Speed loop: open loop and sensitivity",
-        "|L| falls through 1 once, its phase stays above the dashed line there, and |S| stays below 2",
-        "|L| rises to 1 again (use the notch, or a lower bandwidth), or measured points lie off the curve (check "
-        "the frequency response)"),
+        "wherever |L| crosses 1, its phase is not between the dashed lines",
+        "the phase is between the dashed lines where |L| crosses 1 (type in the tuned gains, or request a lower "
+        "bandwidth), or measured points lie off the curve (check the frequency response)"),
     "step": Graph(
         "Speed loop: step of the set speed",
         "the speed settles after one overshoot",

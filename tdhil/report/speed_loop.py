@@ -387,8 +387,8 @@ def draw_loop(figure: FigureBase, document: Part) -> None:
     axes[0].axhline(1.0, color="0.3", lw=0.8)
     axes[0].set(yscale="log", ylabel="|L|")
     axes[1].axhline(-180.0, color="0.3", lw=0.8)
-    axes[1].axhline(-180.0 + required["phase_deg"], color="#c2410c", lw=0.9, ls="--",
-                    label=f"{required['phase_deg']:g}° margin")
+    for side, label in ((1.0, f"{required['phase_deg']:g}° margin"), (-1.0, None)):
+        axes[1].axhline(-180.0 + side * required["phase_deg"], color="#c2410c", lw=0.9, ls="--", label=label)
     rigid = document["plant"]["resonance_hz"] is None
     axes[1].set(ylabel="phase of L, °", ylim=(-270.0, -30.0 if rigid else 90.0),
                 yticks=(-270, -225, -180, -135, -90, -45) if rigid else (-270, -180, -90, 0, 90))
