@@ -9,7 +9,7 @@ from tdhil.errors import MessageCode, UsageError
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of an MCAP file."""
 _HEAD_BYTES = 65_536
-LOG, RESULT, PAGE, PDF = "a log", "a result of tdhil", "an HTML page", "a PDF file"
+LOG, RESULT, PAGE, PDF, YAML = "a log", "a result of tdhil", "an HTML page", "a PDF file", "a YAML file"
 
 
 def begins_like_log(head: bytes) -> bool:
@@ -33,7 +33,7 @@ def kind_of(path: Path) -> str:
         return PAGE
     if text.startswith(b"%pdf"):
         return PDF
-    return "a YAML file" if path.suffix.lower() in (".yaml", ".yml") else ""
+    return YAML if path.suffix.lower() in (".yaml", ".yml") else ""
 
 
 def require_log_kind(path: Path, command: str, *, trace: bool = False) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from profiles import load_profile
 from tdhil.errors import MessageCode, TdhilError, UsageError
+from tdhil.file_kind import PAGE, PDF, YAML, kind_of
 
 if TYPE_CHECKING:
     from profiles import Profile, SpeedControllerParameters
@@ -21,14 +22,14 @@ if TYPE_CHECKING:
 COVERAGE: Final = 0.95
 """Coverage of the intervals from which a tuning is made."""
 _IDENTIFY_J: Final = "Identify again with a motion that identifies J"
+_A_RESULT: Final = "Name a result.json of tdhil identify --json, or a run.mcap"
 
 
 def require_result(path: Path) -> None:
     """Raise UsageError if the file does not exist."""
     if not path.is_file():
         raise UsageError("this file does not exist", where=str(path),
-                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
-                         entry=MessageCode.FILE_NOT_FOUND)
+                         next_step=_A_RESULT, entry=MessageCode.FILE_NOT_FOUND)
 
 
 def read_result(path: Path) -> Mapping[str, Any]:
@@ -41,6 +42,10 @@ def read_result(path: Path) -> Mapping[str, Any]:
     from tdhil.session import is_log
 
     require_result(path)
+    kind = kind_of(path)
+    if kind in (PAGE, PDF, YAML):
+        raise UsageError(f"is {kind}, not a result of tdhil", where=str(path), next_step=_A_RESULT,
+                         entry=MessageCode.WRONG_KIND_OF_FILE)
     if is_log(path):
         from tdhil.api import identify, read
 
@@ -48,9 +53,8 @@ def read_result(path: Path) -> Mapping[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"is neither a log nor JSON ({str(error)[:80]})", where=str(path),
-                         next_step="Name a result.json of tdhil identify --json, or a run.mcap",
-                         entry=MessageCode.WRONG_KIND_OF_FILE) from None
+        what = f"is damaged JSON ({str(error)[:80]})" if kind else "is neither a log nor JSON"
+        raise UsageError(what, where=str(path), next_step=_A_RESULT, entry=MessageCode.WRONG_KIND_OF_FILE) from None
     if not isinstance(document, dict) or not {"inertia_kg_m2", "gear_ratio", "verdict"} <= document.keys():
         raise UsageError("is JSON, but not a result of tdhil identify", where=str(path),
                          next_step="Write one with: tdhil identify --json > result.json",
@@ -150,11 +154,23 @@ def read_impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
     if document["gear_ratio"] != result["gear_ratio"]:
         raise UsageError(f"was measured with a gear ratio of {document['gear_ratio']:g}, and J with "
                          f"{result['gear_ratio']:g}", where=f"--impedance {path}", entry=MessageCode.WRONG_KIND_OF_FILE)
+    return _with_numbers(found, f"--impedance {path}")
+
+
+def _with_numbers(impedance: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """Return a valid impedance. Raises UsageError without one of its numbers."""
     for key in ("gain_nm_s_rad", "integral_nm_rad", "torque_lag_s", "speed_filter_s"):
-        if not isinstance(found.get(key), dict) or not is_number(found[key].get("value")):
-            raise UsageError(f"{key} is not a number", where=f"--impedance {path}",
-                             entry=MessageCode.WRONG_KIND_OF_FILE)
-    return found
+        if not isinstance(impedance.get(key), dict) or not is_number(impedance[key].get("value")):
+            raise UsageError(f"{key} is not a number", where=where, entry=MessageCode.WRONG_KIND_OF_FILE)
+    return impedance
+
+
+def own_impedance(result: Mapping[str, Any], path: Path) -> Mapping[str, Any] | None:
+    """Return the impedance that the result in ``path`` contains; None without a valid one. Raises UsageError."""
+    found = result.get("impedance")
+    if not isinstance(found, dict) or found.get("verdict") != "valid":
+        return None
+    return _with_numbers(found, str(path))
 
 
 REPORTED_FILTER: Final = "the speed filter as the drive reports it; the rest assumed, not measured"
@@ -300,6 +316,11 @@ def check_inner_lags(namespace: argparse.Namespace) -> None:
                              entry=MessageCode.VALUE_NOT_ALLOWED)
 
 
+def measured_where(namespace: argparse.Namespace) -> str:
+    """Return where the impedance was measured, as words of its source."""
+    return "as measured (--impedance)" if namespace.impedance else "as measured (impedance in the result)"
+
+
 def present_gains(
     namespace: argparse.Namespace, measured: Mapping[str, Any] | None, result: Mapping[str, Any]
 ) -> tuple[PiGains | None, str | None]:
@@ -313,7 +334,7 @@ def present_gains(
         return PiGains(*namespace.present), "as stated (--present)"
     if measured is not None:
         gain, integral = (ends_of(measured[key])[1] for key in ("gain_nm_s_rad", "integral_nm_rad"))
-        return _comparable(gain, integral, "as measured (--impedance)")
+        return _comparable(gain, integral, measured_where(namespace))
     return _reported_gains(result, namespace.rated_torque, namespace.rated_speed)
 
 

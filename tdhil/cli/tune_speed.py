@@ -26,6 +26,8 @@ from tdhil.cli.tune_inputs import (
     inertia_warnings,
     is_number,
     positive_number,
+    measured_where,
+    own_impedance,
     present_gains,
     profile_for,
     read_impedance,
@@ -72,7 +74,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gain-margin", type=float, default=8.0, metavar="DB",
                         help="gain margin in the worst case of all intervals (default 8)")
     parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
-                        help="result of identify --impedance: the lags of the drive's speed loop and its present gains")
+                        help="result of identify --impedance: the lags of the drive's speed loop and its present gains "
+                        "(default: the measured impedance that the result itself contains)")
+    parser.add_argument("--motor-inertia", type=amount(INERTIA), metavar="J",
+                        help="inertia of the motor side, kg·m² at the motor shaft, known to ±10 %%: the motor turns "
+                        "alone while a backlash is open (default: from the result, if that determines it)")
     parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
                         help="time constants inside the drive's speed loop, the speed filter first (default 0.02 "
                         "0.01, assumed)")
@@ -117,9 +123,15 @@ def run(namespace: argparse.Namespace) -> int:
         require_target("--plot", namespace.plot, [namespace.result], "the result")
     with working("reading the result …"):        # a log is identified again, which takes seconds
         result = in_drive_torque(read_result(namespace.result))
-        measured = None if namespace.impedance is None else read_impedance(namespace.impedance, result)
-    lags = lags_in(namespace.inner_lags, namespace.dead_time, measured, reported_filter(result))
-    plant = plant_of(result, lags, namespace.result)
+        measured = (own_impedance(result, namespace.result) if namespace.impedance is None
+                    else read_impedance(namespace.impedance, result))
+    if measured is not None and namespace.dead_time is not None and not namespace.inner_lags:
+        raise UsageError("the measured impedance in the result states all lags, dead time included",
+                         where="--dead-time", next_step="State --inner-lags too, or leave --dead-time out",
+                         entry=MessageCode.VALUE_NOT_ALLOWED)
+    lags = lags_in(namespace.inner_lags, namespace.dead_time, None if namespace.inner_lags else measured,
+                   reported_filter(result), measured_where(namespace))
+    plant, gap_from = with_open_gap(plant_of(result, lags, namespace.result), result, namespace.motor_inertia)
     present, present_from = present_gains(namespace, measured, result)
     case = SpeedLoopCase(plant, namespace.phase_margin, namespace.gain_margin, namespace.bandwidth, present,
                          not namespace.no_notch)
@@ -163,13 +175,14 @@ def _check(namespace: argparse.Namespace) -> None:
 
 def lags_in(
     stated: Sequence[float] | None, dead_time_s: float | None, measured: Mapping[str, Any] | None,
-    reported: tuple[float, bool] | None = None,
+    reported: tuple[float, bool] | None = None, measured_from: str = "",
 ) -> LoopLags:
     """Return the lags of the drive's speed loop and their source. Raises UsageError if all are 0.
 
     ``reported``: filter of the loop as the drive reports it (`reported_filter`); it replaces an assumed one.
     """
     from tdhil.speed_loop import Range
+    ``measured_from``: source of ``measured``.
 
     def open_by(value: float, tolerance: float) -> Range:
         return Range(value, value * (1.0 - tolerance), value * (1.0 + tolerance))
@@ -180,7 +193,7 @@ def lags_in(
         together = _range_or_none(measured.get("inner_lag_s"))
         dead = Range(0.0, 0.0, 0.0 if together is None else ASSUMED_DEAD_TIME_S * (1.0 + ASSUMED_TOLERANCE))
         found = LoopLags(tuple(_range(ends_of(measured[key])) for key in ("speed_filter_s", "torque_lag_s")), dead,
-                         "as measured (--impedance)", together)
+                         measured_from, together)
     else:
         lags = tuple(open_by(lag, STATED_TOLERANCE) for lag in stated or ()) or tuple(
             open_by(lag, ASSUMED_TOLERANCE) for lag in ASSUMED_LAGS_S)
