@@ -201,6 +201,14 @@ class MessageCode(Enum):
         65, "The calibration factor includes the loss of a gear",
         "The torque sensor is behind the gear, and the torque that the gear loses counts as an error of the drive.",
         "Measure at the motor shaft, or note pairs with rising and with falling torque at standstill.")
+    LOOP_GAP_OPEN = (
+        66, "The margins may not hold while the backlash is open",
+        "The motor then turns alone. Its inertia is not known, so the worst case does not contain this motion.",
+        "State the inertia of the motor side with --motor-inertia, or remove the backlash.")
+    LOOP_DISTORTED = (
+        67, "The result does not explain its nonlinear distortion",
+        "The margins are those of a linear shaft. No backlash, friction or torque over the angle explains the rest.",
+        "Look for the cause with tdhil frf, and start with half of P.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from profiles.quantities import FREQUENCY, RPM, TIME, TORQUE
+from profiles import CodedText
+from profiles.quantities import FREQUENCY, INERTIA, RPM, TIME, TORQUE
 from tdhil.cli.arguments import PICTURES, add_option, amount, require_target
 from tdhil.cli.report_file import ReportFile, add_head_options, add_report_option
 from tdhil.cli.results import print_json
@@ -25,9 +26,9 @@ from tdhil.cli.tune_inputs import (
     inertia_to_tune_for,
     inertia_warnings,
     is_number,
-    positive_number,
     measured_where,
     own_impedance,
+    positive_number,
     present_gains,
     profile_for,
     read_impedance,
@@ -49,7 +50,8 @@ ASSUMED_LAGS_S = (0.020, 0.010)
 ASSUMED_DEAD_TIME_S = 0.003
 """Assumed dead time, s: one and a half control periods of 2 ms."""
 STATED_TOLERANCE, ASSUMED_TOLERANCE = 0.1, 0.5
-"""Relative half-width of each lag's interval, for a stated and for an assumed lag."""
+"""Relative half-width of the interval of a stated and of an assumed lag, and of a stated inertia of the motor side."""
+_NO_INERTIA_OF_MOTOR = "the inertia of the motor alone is not known, and the worst case does not contain it"
 
 
 class LoopLags(NamedTuple):
@@ -137,7 +139,7 @@ def run(namespace: argparse.Namespace) -> int:
                          not namespace.no_notch)
     design = design_speed_loop(case)
     tuned_for = _tuned_for(result, namespace, design, profile_for(namespace, result))
-    tuned_for = replace(tuned_for, lags_from=lags.source, present_from=present_from)
+    tuned_for = replace(tuned_for, lags_from=lags.source, present_from=present_from, gap_from=gap_from)
     document = loop_document(design, shaft_in(result), tuned_for)
     if namespace.json:
         print_json(document)
@@ -180,12 +182,9 @@ def lags_in(
     """Return the lags of the drive's speed loop and their source. Raises UsageError if all are 0.
 
     ``reported``: filter of the loop as the drive reports it (`reported_filter`); it replaces an assumed one.
+    ``measured_from``: source of ``measured``.
     """
     from tdhil.speed_loop import Range
-    ``measured_from``: source of ``measured``.
-
-    def open_by(value: float, tolerance: float) -> Range:
-        return Range(value, value * (1.0 - tolerance), value * (1.0 + tolerance))
 
     if measured is not None:
         # --impedance measures the sum better than its parts, and models all of it as first-order lags: a part of it may
@@ -195,15 +194,15 @@ def lags_in(
         found = LoopLags(tuple(_range(ends_of(measured[key])) for key in ("speed_filter_s", "torque_lag_s")), dead,
                          measured_from, together)
     else:
-        lags = tuple(open_by(lag, STATED_TOLERANCE) for lag in stated or ()) or tuple(
-            open_by(lag, ASSUMED_TOLERANCE) for lag in ASSUMED_LAGS_S)
-        dead = (open_by(ASSUMED_DEAD_TIME_S, ASSUMED_TOLERANCE) if dead_time_s is None
-                else open_by(dead_time_s, STATED_TOLERANCE))
+        lags = tuple(_open_by(lag, STATED_TOLERANCE) for lag in stated or ()) or tuple(
+            _open_by(lag, ASSUMED_TOLERANCE) for lag in ASSUMED_LAGS_S)
+        dead = (_open_by(ASSUMED_DEAD_TIME_S, ASSUMED_TOLERANCE) if dead_time_s is None
+                else _open_by(dead_time_s, STATED_TOLERANCE))
         said = "assumed, not measured" if not stated else (
             "as stated" if dead_time_s is not None else "as stated; the dead time is assumed")
         if reported is not None and not stated:
             filter_s, verified = reported
-            lags = (open_by(filter_s, STATED_TOLERANCE if verified else ASSUMED_TOLERANCE), *lags[1:])
+            lags = (_open_by(filter_s, STATED_TOLERANCE if verified else ASSUMED_TOLERANCE), *lags[1:])
             said = REPORTED_FILTER
         found = LoopLags(lags, dead, said)
     if not any(lag.value for lag in found.lags_s) and not dead.value:
@@ -233,6 +232,43 @@ def plant_of(result: Mapping[str, Any], lags: LoopLags, path: Path) -> Uncertain
     return UncertainPlant(
         Range(value, low, high), damping, lags.lags_s, lags.dead_time_s, _range(swings[0]), _range(swings[1]),
         _range_or_none(shaft.get("damping_nm_s_rad")) or Range(0.0, 0.0, 0.0), lag_sum_s=lags.sum_s)
+
+
+def with_open_gap(
+    plant: UncertainPlant, result: Mapping[str, Any], motor_kg_m2: float | None
+) -> tuple[UncertainPlant, str | None]:
+    """Return the plant with the motor side that turns alone while a backlash is open, and the source of its inertia.
+
+    The source is None without backlash. Without an inertia, it states that. Raises UsageError if it exceeds J.
+    """
+    from tdhil.speed_loop import Range
+
+    total = plant.inertia_kg_m2
+    if motor_kg_m2 is not None:
+        found = _open_by(motor_kg_m2 / calibration_factor(result), STATED_TOLERANCE)
+        if not 0.0 < found.value <= total.high:
+            raise UsageError(f"{motor_kg_m2:g}: must be above 0 and at most J of {total.high:.4g} kg·m²",
+                             where="--motor-inertia", entry=MessageCode.VALUE_NOT_ALLOWED)
+        return replace(plant, gap_kg_m2=found), "as stated (--motor-inertia)"
+    plays = result.get("backlash")
+    if not plays:
+        return plant, None
+    if plant.resonance_hz is not None:
+        return replace(plant, gap_kg_m2=total), "J of the motor side"
+    # the motor sees J_L/J of the play
+    seen = [tuple(bounded_estimate(one.get(key)) for key in ("at_motor_rad", "play_rad")) for one in plays]
+    shares = [(part[1] / whole[1], part[2] / whole[0]) for part, whole in seen if part and whole]
+    value, high = (max((one[k] for one in shares), default=1.0) for k in range(2))
+    if len(shares) < len(plays) or high >= 1.0:
+        return plant, _NO_INERTIA_OF_MOTOR
+    gap = Range(total.value * (1.0 - value), total.low * (1.0 - high), total.high)
+    return replace(plant, gap_kg_m2=gap), "from the play and the part of it that the motor shows"
+
+
+def _open_by(value: float, tolerance: float) -> Range:
+    from tdhil.speed_loop import Range
+
+    return Range(value, value * (1.0 - tolerance), value * (1.0 + tolerance))
 
 
 def _has_value(part: Any) -> bool:
@@ -291,8 +327,16 @@ def _tuned_for(
                 settings[row.kind] += notch_settings(parameters.notch, row.gains.notch.quantities())
         if parameters.note:
             warnings.append(f"{profile.name}: {parameters.note}")
+    distortion = (result.get("frequency_response") or {}).get("distortion") or {}
+    if distortion.get("detected") and not (
+            result.get("backlash") or result.get("harmonics") or "bent friction" in str(result.get("model"))):
+        warnings.append(CodedText(
+            "The frequency response shows nonlinear distortion that the result does not explain. The margins are those "
+            "of a linear shaft. Look for the cause with tdhil frf, and start with half of P.",
+            MessageCode.LOOP_DISTORTED))
     return LoopTunedFor(str(namespace.result), bool(result.get("simulated")), str(result.get("model")),
                         None if profile is None else profile.name, float(result["gear_ratio"]), settings=settings,
                         notch_named=parameters is not None and bool(parameters.notch), warnings=tuple(warnings),
                         reported_speed_lag_s=_range_or_none(result.get("speed_lag_s")),
+                        coulomb_nm=_range_or_none(result.get("coulomb_nm")),
                         rehearsed_faults=tuple(result.get("rehearsed_faults") or ()))

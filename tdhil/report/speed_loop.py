@@ -77,6 +77,8 @@ class LoopTunedFor:
     lags_from: str = ""
     present_from: str | None = None
     """Source of the present gains, or why they are not known; None: no source."""
+    gap_from: str | None = None
+    """Source of the inertia of the motor side, which turns alone while a backlash is open; None: no backlash."""
     settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
     """Settings in the drive's own parameters, by the row's kind."""
     notch_named: bool = False
@@ -84,10 +86,10 @@ class LoopTunedFor:
     warnings: tuple[str, ...] = ()
     reported_speed_lag_s: Range | None = None
     """Lag of the reported speed, for tune verify; None: unknown."""
-    rehearsed_faults: tuple[str, ...] = ()
-    """Faults that were scripted in the run."""
     coulomb_nm: Range | None = None
     """Coulomb friction, for the plan of tune verify; None: unknown."""
+    rehearsed_faults: tuple[str, ...] = ()
+    """Faults that were scripted in the run."""
 
 
 def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> dict[str, Any]:
@@ -105,13 +107,15 @@ def loop_document(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: Lo
         "plant": {name: None if part is None else [asdict(one) for one in part] if isinstance(part, tuple)
                   else asdict(part) for name, part in vars(plant).items()} | {
             "total_inertia_kg_m2": plant.believed.total_inertia_kg_m2, "lags_from": tuned_for.lags_from,
+            "gap_from": tuned_for.gap_from, "coulomb_nm": tuned_for.coulomb_nm and asdict(tuned_for.coulomb_nm),
         },
         "reported_speed_lag_s": None if tuned_for.reported_speed_lag_s is None else asdict(
             tuned_for.reported_speed_lag_s),
         "required": {"phase_deg": case.phase_deg, "gain_db": case.gain_db, "bandwidth_hz": case.bandwidth_hz},
         "controllers": [_controller(row, design, tuned_for.settings.get(row.kind, ())) for row in design.rows],
         "bandwidth_without_notch_hz": design.without_notch_hz,
-        "sentence": _sentence(design),
+        "sentence": _sentence(design, open_gap=_misses_gap(design, tuned_for)),
+        "gains_by_hand": _gains_by_hand(tuned_for),
         "notch_by_hand": _notch_by_hand(design.tuned.gains.notch, tuned_for),
         "curves": {row.kind: _curves(loop_curve(design, row.gains, lowest_hz)) for row in design.rows},
         "measured": None if shaft is None else {
@@ -148,7 +152,7 @@ def _failed(row: LoopRow, design: LoopDesign) -> Iterator[str]:
     """Yield each margin that is below the required one in the worst case."""
     worst, case = row.worst, design.case
     if not worst.stable:
-        yield "unstable in the worst case"
+        yield "unstable in the worst case" if row.believed.stable else "unstable, also with the best estimate"
         return
     if worst.conditional:
         yield "unstable with a lower gain, such as at the torque limit"
@@ -161,8 +165,13 @@ def _failed(row: LoopRow, design: LoopDesign) -> Iterator[str]:
 def _warnings(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTunedFor) -> Iterator[str]:
     for row in design.rows[:-1]:
         if failed := list(_failed(row, design)):
-            yield CodedText(f"The present gains have thin margins: {', '.join(failed)}.",
-                            MessageCode.PRESENT_GAINS_THIN)
+            what = "The present gains have thin margins:" if row.worst.stable else "The present loop is"
+            yield CodedText(f"{what} {', '.join(failed)}.", MessageCode.PRESENT_GAINS_THIN)
+    if _misses_gap(design, tuned_for):
+        yield CodedText(
+            "The coupling or gear behind the motor has backlash. While it is open, the motor turns alone with less "
+            "inertia than J, and the margins do not hold. State the inertia of the motor side with --motor-inertia, or "
+            "remove the backlash.", MessageCode.LOOP_GAP_OPEN)
     if "assumed" in tuned_for.lags_from:
         yield CodedText(
             "The lags of the speed loop are assumed, and they limit its gains. Measure them with tdhil identify "
@@ -186,8 +195,15 @@ def _warnings(design: LoopDesign, shaft: MeasuredShaft | None, tuned_for: LoopTu
                         f"{100.0 * float(off[unlike].max()):.0f} %.", MessageCode.LOOP_UNLIKE_RESPONSE)
 
 
-def _sentence(design: LoopDesign) -> str:
+def _misses_gap(design: LoopDesign, tuned_for: LoopTunedFor) -> bool:
+    """Return whether a backlash was found, and the worst case does not contain the motor side alone."""
+    return tuned_for.gap_from is not None and design.case.plant.gap_kg_m2 is None
+
+
+def _sentence(design: LoopDesign, *, open_gap: bool) -> str:
+    """Return the answer. ``open_gap``: the margins do not hold while a backlash is open."""
     tuned, case = design.tuned, design.case
+    closed = " while the backlash is closed" if open_gap else ""
     notch = tuned.gains.notch
     with_notch = "" if notch is None else f", with a notch at {notch.hertz:.3g} Hz"
     gains = (f"P = {gain_words(tuned.gains.gain_nm_s_rad)} N·m·s/rad and "
@@ -195,16 +211,26 @@ def _sentence(design: LoopDesign) -> str:
     present = next((row for row in design.rows if row.kind == "present"), None)
     if (present is not None and case.bandwidth_hz is None and present.bandwidth_hz.value >= tuned.bandwidth_hz.value
             and present.worst.keeps(case.phase_deg, case.gain_db)):
-        return (f"The present gains keep the margins and are faster: {present.bandwidth_hz.value:.3g} Hz, "
+        return (f"The present gains keep the margins{closed} and are faster: {present.bandwidth_hz.value:.3g} Hz, "
                 f"{present.worst.phase_deg:.0f}° and {_number(present.worst.gain_db, 1)} dB. With I = P²/(4 J), which "
                 f"removes a lasting error sooner, the largest bandwidth is {tuned.bandwidth_hz.value:.3g} Hz: {gains}.")
     said = f"Type in {gains}."
     kind = "requested bandwidth" if case.bandwidth_hz is not None else "largest bandwidth with I = P²/(4 J)"
     said += (f" The {kind} is {tuned.bandwidth_hz.value:.3g} Hz, with at least {tuned.worst.phase_deg:.0f}° "
-             f"and {_number(tuned.worst.gain_db, 1)} dB in the worst case.")
+             f"and {_number(tuned.worst.gain_db, 1)} dB in the worst case{closed}.")
     if present is not None and present.worst.stable:
         said += f" The present gains give {present.bandwidth_hz.value:.3g} Hz and {present.worst.phase_deg:.0f}°."
     return said
+
+
+def _gains_by_hand(tuned_for: LoopTunedFor) -> str | None:
+    """Return the units of P and I if no parameters of the drive are known; else None."""
+    if tuned_for.settings.get("tuned"):
+        return None
+    who = (f"The profile {tuned_for.profile} names no parameters of the speed loop for this drive." if tuned_for.profile
+           else "The drive's parameters of the speed loop are not known without a profile.")
+    return (f"{who} P is given in N·m·s/rad, I in N·m/rad and T_I in s, at the motor shaft. Look up the drive's "
+            "parameters and units in its manual, and convert.")
 
 
 def _notch_by_hand(notch: NotchFilter | None, tuned_for: LoopTunedFor) -> str | None:
@@ -258,6 +284,8 @@ def print_loop_tuning(document: Part, console: PlainConsole) -> None:
                                 ((name, *cells) for name, cells in _rows(document))))
     console.print(names_and_texts(_EXPLAINED.items(), quiet=True))
     console.print()
+    if document["gains_by_hand"] is not None:
+        console.print(Words(document["gains_by_hand"]))
     print_settings(list(_setting_rows(document)), console)
     if document["notch_by_hand"] is not None:
         console.print()
@@ -277,14 +305,22 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
         yield "antiresonance", part_with_interval(plant["antiresonance_hz"], "Hz")
         yield "resonance", part_with_interval(plant["resonance_hz"], "Hz")
     yield "lags in the loop", f"{_lag_words(plant)}; {plant['lags_from']}"
+    if plant["gap_from"] is not None:
+        gap = plant["gap_kg_m2"]
+        yield "backlash, open", plant["gap_from"] if gap is None else (
+            f"motor alone with {part_with_interval(gap, 'kg·m²')}; {plant['gap_from']}")
     if document["tuned_for"]["present_from"] is not None:
         yield "present gains", document["tuned_for"]["present_from"]
     required = document["required"]
     yield "required margins", f"{required['phase_deg']:g}° and {required['gain_db']:g} dB in the worst case"
     if document["measured"]:
-        off, hertz = document["measured"]["deviation_rel"], document["measured"]["hertz"]
-        yield "measured response", (f"{len(hertz)} lines from {min(hertz):.3g} to {max(hertz):.3g} Hz; without the "
-                                    f"lags of the reports, up to {_percent(max(off))} % from this shaft")
+        off, hertz, known = (document["measured"][key] for key in ("deviation_rel", "hertz", "half_rel"))
+        # the line that contradicts this shaft most, not the one that is known worst
+        most = max(range(len(off)), key=lambda k: off[k] / known[k] if known[k] else 0.0)
+        sure = "not bounded" if known[most] is None else f"known to ±{_percent(known[most])} %"
+        yield "measured response", (
+            f"{len(hertz)} lines from {min(hertz):.3g} to {max(hertz):.3g} Hz; without the lags of the reports, the "
+            f"line at {hertz[most]:.3g} Hz is farthest from this shaft: by {_percent(off[most])} %, {sure}")
 
 
 def _lag_words(plant: Part) -> str:
@@ -444,6 +480,8 @@ def loop_report(document: Part) -> Report:
                     "Speed of the motor after a small step, without torque limit, ramp or setpoint filter."),
         )),
     ]
+    if document["gains_by_hand"] is not None:
+        sections.append(ReportSection("Units of the gains", (Text(document["gains_by_hand"]),)))
     sections.append(settings_section(list(_setting_rows(document))))
     if document["notch_by_hand"] is not None:
         sections.append(ReportSection("Notch filter, to be set by hand", (Text(document["notch_by_hand"]),)))
@@ -459,7 +497,8 @@ def loop_report(document: Part) -> Report:
         answer=AnswerBox(
             "green", f"P = {gain_words(tuned['gain_nm_s_rad'])} N·m·s/rad, "
             f"I = {gain_words(tuned['integral_nm_rad'])} N·m/rad", ("at the motor shaft",),
-            f"keeps {_number(worst['phase_deg'], 0)}° and {_number(worst['gain_db'], 1)} dB in the worst case",
+            f"keeps {_number(worst['phase_deg'], 0)}° and {_number(worst['gain_db'], 1)} dB in the worst case"
+            + (" while the backlash is closed" if "TDH-066" in document["warning_codes"] else ""),
             document["sentence"], ""),
         warnings=tuple(map(with_code, document["warnings"], document["warning_codes"])),
         sections=tuple(sections),

@@ -6,6 +6,7 @@ at all corners, or the P with the requested bandwidth.
 
 **Corners.** J, friction, lags (all together), antiresonance, resonance and the spring's damping, each at both ends of
 its 95 % interval. If only the sum of two lags is known well, each sum is split in all ways that matter (`_splits`).
+While a backlash is open, the motor side turns alone: its least inertia without friction is a corner too.
 `benchmarks/speed_loop_margins.py` measures how often the true loop keeps the margins.
 
 **Notch.** If the shaft has a resonance, notches of several widths and depths at that frequency are tried. A notch is
@@ -15,9 +16,9 @@ offered if it multiplies the largest bandwidth by `NOTCH_GAIN` or more, or if no
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
-from math import inf, isfinite, sqrt
+from math import inf, isfinite, nan, sqrt
 
 import numpy as np
 
@@ -95,6 +96,8 @@ class UncertainPlant:
     damping_nm_s_rad: Range | None = None
     lag_sum_s: Range | None = None
     """Sum of two lags and the dead time, if it is known better than each. None: all lags are at the same end."""
+    gap_kg_m2: Range | None = None
+    """Inertia of the motor side, which turns alone while a backlash is open. None: not in the worst case."""
 
     @property
     def believed(self) -> LoopPlant:
@@ -114,15 +117,26 @@ class UncertainPlant:
         first, second = self.lags_s
         return _first_lags(first, second, self.lag_sum_s.value)
 
-    def corners(self) -> tuple[LoopPlant, ...]:
-        """Return the plants at all combinations of interval ends."""
-        lags: Sequence[tuple[tuple[float, ...], float]] = (
-            (tuple(lag.low for lag in self.lags_s), self.dead_time_s.low),
-            (tuple(lag.high for lag in self.lags_s), self.dead_time_s.high))
+    def _lag_corners(self) -> Sequence[tuple[tuple[float, ...], float]]:
+        """Return the combinations of lags and dead time."""
         if self.lag_sum_s is not None:
             first, second = self.lags_s
-            lags = [(pair, dead) for total in self.lag_sum_s.ends for dead in self.dead_time_s.ends
-                    for pair in _splits(first, second, total - dead)]
+            return tuple(dict.fromkeys((pair, dead) for total in self.lag_sum_s.ends for dead in self.dead_time_s.ends
+                                       for pair in _splits(first, second, total - dead)))
+        return ((tuple(lag.low for lag in self.lags_s), self.dead_time_s.low),
+                (tuple(lag.high for lag in self.lags_s), self.dead_time_s.high))
+
+    def gap_corners(self) -> tuple[LoopPlant, ...]:
+        """Return the plants of the motor side alone; () if it is not in the worst case.
+
+        The least inertia is the worst one: it has the highest crossover. The corners of J are at the other end.
+        """
+        if self.gap_kg_m2 is None:
+            return ()
+        return tuple(LoopPlant(self.gap_kg_m2.low, 0.0, *lags) for lags in self._lag_corners())
+
+    def corners(self) -> tuple[LoopPlant, ...]:
+        """Return the plants at all combinations of interval ends, with `gap_corners` at the end."""
         springs: list[SpringLoad | None] = [None]
         if self.antiresonance_hz is not None and self.resonance_hz is not None:
             dampings = self.damping_nm_s_rad.ends if self.damping_nm_s_rad else (0.0,)
@@ -130,7 +144,7 @@ class UncertainPlant:
         return tuple(
             LoopPlant(inertia, viscous, late, dead, spring)
             for inertia, viscous, (late, dead), spring in product(
-                self.inertia_kg_m2.ends, self.viscous_nm_s_rad.ends, dict.fromkeys(lags), springs))
+                self.inertia_kg_m2.ends, self.viscous_nm_s_rad.ends, self._lag_corners(), springs)) + self.gap_corners()
 
 
 def _first_lags(first: Range, second: Range, sum_s: float) -> tuple[float, float]:
@@ -178,6 +192,7 @@ class LoopRow:
     worst: SpeedLoopMargins
     """Smallest value of each margin over all corners; greatest peak of the sensitivity."""
     bandwidth_hz: Range
+    """Bandwidth; NaN without a stable loop. Bandwidth and step: without the motor side alone."""
     overshoot_share: Range
     rise_s: Range
     settling_s: Range
@@ -304,12 +319,17 @@ def design_speed_loop(case: SpeedLoopCase) -> LoopDesign:
         found = search.with_bandwidth(hertz, largest.notch)
         if not search.fits(found):
             worst = worst_of(search.margins(found))
-            what = ("the loop is unstable or conditionally stable at a corner of the intervals" if not worst.stable
-                    or worst.conditional else f"the worst case has {printed_bound(worst.phase_deg, 3)}° and "
-                    f"{printed_bound(worst.gain_db, 3)} dB")
+            if not worst.stable:
+                what = f"with a bandwidth of {hertz:g} Hz the loop is unstable in the worst case"
+            elif worst.conditional:
+                what = (f"with a bandwidth of {hertz:g} Hz, a lower gain makes the loop unstable in the worst case, "
+                        "such as at the torque limit")
+            else:
+                what = (f"a bandwidth of {hertz:g} Hz leaves too little margin: the worst case has "
+                        f"{printed_bound(worst.phase_deg, 3)}° and {printed_bound(worst.gain_db, 3)} dB "
+                        f"(limits {case.phase_deg:g}° and {case.gain_db:g} dB)")
             raise LoopTuningRefused(
-                f"a bandwidth of {hertz:g} Hz leaves too little margin: {what} (limits {case.phase_deg:g}° and "
-                f"{case.gain_db:g} dB). The largest bandwidth that fits is {search.bandwidth_hz(largest):.3g} Hz",
+                f"{what}. The largest bandwidth that fits is {search.bandwidth_hz(largest):.3g} Hz",
                 next_step=f"Request --bandwidth {printed_bound(search.bandwidth_hz(largest), 2)} or less")
     if not all(is_stable_loop(plant, found) for plant in (search.believed, *search.corners)):
         raise LoopTuningRefused("the poles of the tuned loop contradict its margins",
@@ -337,19 +357,26 @@ def worst_of(margins: tuple[SpeedLoopMargins, ...]) -> SpeedLoopMargins:
 
 
 def _row(kind: str, search: _GainSearch, gains: PiGains) -> LoopRow:
-    margins = search.margins(gains)
-    every = (search.believed, *search.corners)
-    stable = [plant for plant, one in zip(every, margins, strict=True) if one.stable and is_stable_loop(plant, gains)]
+    every = search.margins(gains)
+    # the motor side alone counts in the margins: a whole step does not fit into an open backlash
+    plants = (search.believed, *search.corners[:len(search.corners) - len(search.case.plant.gap_corners())])
+    margins = every[:len(plants)]
+    stable = [plant for plant, one in zip(plants, margins, strict=True) if one.stable and is_stable_loop(plant, gains)]
     span = _STEP_SPAN * search.total / max(gains.gain_nm_s_rad, 1e-9 * search.unit)
     time_s, speeds = step_responses(stable, gains, span)
     figures = [step_figures(time_s, speed) for speed in speeds]
-    whole = len(stable) == len(every)
+    whole = len(stable) == len(plants)
     shown = speeds if whole else np.full((1, len(time_s)), np.nan)
     bandwidths = [one.bandwidth_hz for one in margins]
+    # an unstable loop has no bandwidth
+    value = bandwidths[0] if margins[0].stable else nan
+    bandwidth = Range(value, min(bandwidths), max(bandwidths)) if whole else Range(value, nan, nan)
+    worst = worst_of(every)
     overshoot, rise, settling = (_spread(figures, name, whole) for name in
                                  ("overshoot_share", "rise_s", "settling_s"))
     return LoopRow(
-        kind, gains, margins[0], worst_of(margins), Range(bandwidths[0], min(bandwidths), max(bandwidths)),
+        kind, gains, replace(margins[0], bandwidth_hz=value),
+        worst if worst.stable else replace(worst, bandwidth_hz=nan), bandwidth,
         overshoot, rise, settling, time_s, shown[0], shown.min(axis=0), shown.max(axis=0))
 
 

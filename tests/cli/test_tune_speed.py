@@ -336,3 +336,164 @@ def test_the_gains_of_a_calibrated_result_are_in_the_drive_s_own_torque(tuned):
         assert ours[name] == pytest.approx(theirs[name], rel=1e-6)
     assert any("torque calibration (factor 1.1)" in warning for warning in found["warnings"])
     assert not any("torque calibration" in warning for warning in plain["warnings"])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Backlash and distortion
+
+LAGS = ("--inner-lags", "20ms", "10ms", "--dead-time", "3ms")
+UNSIZED = [{"play_rad": None, "at_motor_rad": None}]
+
+
+def sized(share, width=1.05):
+    """Return a play of 20 mrad, of which the motor shows a share."""
+    return [{"play_rad": interval(0.02, 0.02 / width, 0.02 * width),
+             "at_motor_rad": interval(0.02 * share, 0.02 * share / width, 0.02 * share * width)}]
+
+
+def test_a_backlash_without_the_motors_inertia_is_named_and_the_promise_withdrawn(tuned):
+    code, document, _ = tuned(*LAGS, backlash=UNSIZED)
+    assert code == 0
+    assert "TDH-066" in document["warning_codes"] and document["plant"]["gap_kg_m2"] is None
+    assert "in the worst case while the backlash is closed." in document["sentence"]
+    _, text, _ = tuned(*LAGS, as_json=False, backlash=UNSIZED)
+    words = " ".join(text.split())
+    assert "backlash, open the inertia of the motor alone is not known" in words
+    assert "State the inertia of the motor side with --motor-inertia" in words
+    for none in ([], None):
+        _, document, _ = tuned(*LAGS, backlash=none)
+        assert "TDH-066" not in document["warning_codes"] and "backlash" not in document["sentence"]
+
+
+@pytest.mark.parametrize(("words", "said", "least_kg_m2", "source"), [
+    (("--motor-inertia", "7.5"), {"backlash": UNSIZED}, 6.75, "as stated (--motor-inertia)"),
+    (("--motor-inertia", "7.5"), {}, 6.75, "as stated (--motor-inertia)"),
+    # the motor shows J_L/J of the play
+    ((), {"backlash": sized(0.5)}, 14.25 * (1.0 - 0.5 * 1.05**2), "from the play and the part of it"),
+])
+def test_the_motor_alone_is_a_corner_where_its_inertia_is_known(tuned, words, said, least_kg_m2, source):
+    inertia = {"inertia_kg_m2": estimate(15.0, 14.25, 15.75)}
+    _, before, _ = tuned(*LAGS, **inertia)
+    code, document, _ = tuned(*LAGS, *words, **inertia, **said)
+    assert code == 0
+    assert document["plant"]["gap_kg_m2"]["low"] == pytest.approx(least_kg_m2)
+    assert source in document["plant"]["gap_from"]
+    assert "TDH-066" not in document["warning_codes"] and "while the backlash" not in document["sentence"]
+    ours, theirs = (one["controllers"][-1] for one in (document, before))
+    assert ours["gain_nm_s_rad"] < 0.8 * theirs["gain_nm_s_rad"]
+    assert ours["worst"]["phase_deg"] == pytest.approx(45.0, abs=0.1)
+    _, text, _ = tuned(*LAGS, *words, as_json=False, **inertia, **said)
+    assert "backlash, open motor alone with" in " ".join(text.split())
+
+
+def test_a_share_of_the_play_that_may_be_the_whole_gives_no_inertia_of_the_motor(tuned):
+    _, document, _ = tuned(*LAGS, backlash=sized(0.8, 1.2))
+    assert document["plant"]["gap_kg_m2"] is None and "TDH-066" in document["warning_codes"]
+
+
+@pytest.mark.parametrize("inertia", ["0", "200"])
+def test_an_inertia_of_the_motor_that_cannot_be_is_refused(tuned, inertia):
+    code, document, _ = tuned("--motor-inertia", inertia)
+    assert code == ExitCode.USAGE and "--motor-inertia" in document["error"]["message"]
+
+
+def test_the_inertia_of_the_motor_is_converted_to_the_drive_s_own_torque(tuned):
+    _, document, _ = tuned("--motor-inertia", "7", torque_calibration={"factor": 1.1, "rel_sd": 0.005})
+    assert document["plant"]["gap_kg_m2"]["value"] == pytest.approx(7.0 / 1.1)
+
+
+def test_distortion_without_a_known_cause_is_a_warning(tuned):
+    bent = {"frequency_response": response() | {"distortion": {"detected": True}}}
+    _, document, _ = tuned(**bent)
+    assert "TDH-067" in document["warning_codes"]
+    for explained in ({"backlash": UNSIZED}, {"harmonics": [{}]}, {"model": "rigid+lags, bent friction"}):
+        _, document, _ = tuned(**bent, **explained)
+        assert "TDH-067" not in document["warning_codes"]
+    _, document, _ = tuned(frequency_response=response() | {"distortion": {"detected": False}})
+    assert "TDH-067" not in document["warning_codes"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What the card states
+
+
+def test_the_impedance_in_the_result_itself_is_used(tuned, tmp_path):
+    """The card advised to measure what the same file contained."""
+    code, document, _ = tuned(impedance=impedance(), speed_loop_present=reported())
+    assert code == 0
+    assert document["plant"]["lags_from"] == "as measured (impedance in the result)"
+    assert [lag["value"] for lag in document["plant"]["lags_s"]] == [0.021, 0.012]
+    assert present_in(document) == ((203.0, 264.5),
+                                    "as measured (impedance in the result)")
+    assert "TDH-056" not in document["warning_codes"]
+    _, text, _ = tuned(as_json=False, impedance=impedance())
+    assert "as measured (impedance in the result)" in " ".join(text.split())
+    path, other = tmp_path / "z.json", impedance()
+    other["speed_filter_s"] = interval(0.025, 0.02, 0.03)
+    path.write_text(json.dumps(result(impedance=other)), encoding="utf-8")
+    _, document, _ = tuned("--impedance", path, impedance=impedance())
+    assert document["plant"]["lags_s"][0]["value"] == 0.025
+    assert document["plant"]["lags_from"] == "as measured (--impedance)"
+    _, document, _ = tuned(*LAGS, "--present", 20, 10, impedance=impedance())
+    assert document["plant"]["lags_s"][0]["value"] == 0.02 and present_in(document)[0] == (20.0, 10.0)
+    assert tuned("--dead-time", "3ms", impedance=impedance())[0] == ExitCode.USAGE
+    _, document, _ = tuned(impedance={"verdict": "model_rejected", "reason": "", "advice": ""})
+    assert "assumed" in document["plant"]["lags_from"]
+
+
+def test_a_profile_without_parameters_of_the_speed_loop_is_named_with_the_units(tuned):
+    _, text, _ = tuned(*LAGS, "--profile", "maxon/epos4", as_json=False)
+    words = " ".join(text.split())
+    assert "The profile maxon/epos4 names no parameters of the speed loop for this drive. P is given in N·m" in words
+    _, text, _ = tuned(*LAGS, as_json=False)
+    assert "are not known without a profile. P is given in N·m·s/rad" in " ".join(text.split())
+    assert max(map(len, text.splitlines())) <= 80
+    _, document, _ = tuned(*LAGS, "--profile", "siemens/s120-canopen")
+    assert document["gains_by_hand"] is None
+
+
+def test_an_unstable_loop_has_no_bandwidth_and_the_warning_says_so(tuned):
+    _, document, _ = tuned("--present", 5000, 90000)
+    row = document["controllers"][0]
+    assert row["bandwidth_hz"]["value"] is None and row["as_believed"]["bandwidth_hz"] is None
+    (warning,) = (one for one in document["warnings"] if "present" in one)
+    assert warning == "The present loop is unstable, also with the best estimate."
+    _, text, _ = tuned("--present", 5000, 90000, as_json=False)
+    assert re.search(r"bandwidth, Hz +– ", text)
+
+
+def test_the_named_line_is_the_one_that_contradicts_the_shaft_most(tuned):
+    """A line of ±30 % that was 20 % off was named, and no line contradicted the shaft."""
+    lines = response()["lines"]
+    size = lines[0]["magnitude"]
+    size.update(value=1.2 * size["value"], low=0.9 * size["value"], high=1.7 * size["value"])      # +20 %, ±33 %
+    size = lines[1]["magnitude"]
+    size.update({key: 1.02 * size[key] for key in ("value", "low", "high")})                       # +2 %, ±1 %
+    _, text, _ = tuned(*LAGS, as_json=False, frequency_response={"lines": lines})
+    assert "the line at 0.3 Hz is farthest from this shaft: by 2 %, known to ±1 %" in " ".join(text.split())
+
+
+def test_the_line_below_the_open_loop_agrees_with_the_proposal(tuned):
+    """|L| may rise above 1 again at a resonance: the margins hold there, and the line called it bad."""
+    _, document, _ = tuned(*LAGS, "--no-notch", compliant=COMPLIANT, frequency_response=None)
+    curve = document["curves"]["tuned"]
+    gain, phase = curve["gain"]["value"], curve["phase_deg"]["value"]
+    crossings = [k for k in range(len(gain) - 1) if (gain[k] > 1.0) != (gain[k + 1] > 1.0)]
+    assert len(crossings) >= 3
+    assert all(abs(phase[k] + 180.0) > 45.0 for k in crossings)
+    good, bad = GRAPHS["open_loop"].good, GRAPHS["open_loop"].bad
+    assert good == "wherever |L| crosses 1, its phase is not between the dashed lines"
+    assert "rises" not in bad and "between the dashed lines" in bad
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (b"<!DOCTYPE html>", "is an HTML page, not a result of tdhil"),
+    (b"%PDF-1.7", "is a PDF file, not a result of tdhil"),
+    (b'{"tdhil": 1', "is damaged JSON"), (b"speed\n1\n", "is neither a log nor JSON"),
+])
+def test_a_file_of_another_kind_is_named(tmp_path, capsys, content, said):
+    path = tmp_path / "run1.html"
+    path.write_bytes(content)
+    assert main(["tune", "speed", str(path)]) == ExitCode.USAGE
+    err = capsys.readouterr().err
+    assert said in err and "Expecting value" not in err

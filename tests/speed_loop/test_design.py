@@ -116,6 +116,15 @@ def test_a_requested_bandwidth_is_met_or_refused_with_the_largest_possible_one()
         design_speed_loop(SpeedLoopCase(RIGID, bandwidth_hz=10.0))
 
 
+def test_a_refused_bandwidth_has_one_reason():
+    """An unstable loop was said to leave too little margin, and to be unstable or conditionally stable."""
+    with pytest.raises(LoopTuningRefused) as refused:
+        design_speed_loop(SpeedLoopCase(RIGID, bandwidth_hz=50.0))
+    text = str(refused.value)
+    assert text.startswith("with a bandwidth of 50 Hz the loop is unstable in the worst case. The largest bandwidth")
+    assert "margin" not in text and "conditional" not in text
+
+
 @pytest.mark.parametrize("largest_hz", [4.97, 10.7])
 def test_the_bandwidth_that_the_refusal_advises_fits(largest_hz):
     """The largest one, 4.97 Hz, used to be rounded to 5 Hz in the advice, which was refused again."""
@@ -143,10 +152,31 @@ def test_lags_that_may_be_zero_still_have_a_worst_case():
     assert tuned.worst.phase_deg == pytest.approx(45.0, abs=0.1)
 
 
-def test_a_present_loop_that_is_unstable_has_no_step_response():
+def test_a_present_loop_that_is_unstable_has_neither_bandwidth_nor_step_response():
     row = design_speed_loop(SpeedLoopCase(RIGID, present=PiGains(3e4, 1e6))).rows[0]
-    assert not row.worst.stable
+    assert not row.worst.stable and not row.believed.stable
     assert np.isinf(row.settling_s.high) and np.isnan(row.speed).all()
+    assert np.isnan([row.bandwidth_hz.value, row.bandwidth_hz.high, row.believed.bandwidth_hz,
+                     row.worst.bandwidth_hz]).all()
+
+
+@pytest.mark.parametrize(("plant", "motor"), [(RIGID, 52.0), (RIGID, 20.0), (COMPLIANT, 0.5)])
+def test_the_margins_hold_for_the_motor_alone_while_a_backlash_is_open(plant, motor):
+    """With J alone, 45° were promised, and the motor side with half of J had 30° in the worst case."""
+    gap = Range(motor, 0.9 * motor, 1.1 * motor)
+    alone = [LoopPlant(share * motor, viscous, tuple(lag.high for lag in plant.lags_s), plant.dead_time_s.high)
+             for share in (0.9, 1.0, 1.1) for viscous in (0.0, plant.viscous_nm_s_rad.value)]
+    before = design_speed_loop(SpeedLoopCase(plant, try_notch=False)).tuned
+    tuned = design_speed_loop(SpeedLoopCase(replace(plant, gap_kg_m2=gap), present=before.gains, try_notch=False))
+    for one in alone:
+        true = true_margins(one, tuned.tuned.gains)
+        assert true.stable and true.phase_deg >= 44.95 and true.gain_db >= 7.98
+    assert tuned.tuned.worst.phase_deg >= 45.0
+    if plant is RIGID:
+        assert min(true_margins(one, before.gains).phase_deg for one in alone) < 40.0
+        assert tuned.rows[0].worst.phase_deg < 40.0
+        # a whole step turns the load too
+        assert tuned.rows[0].settling_s == before.settling_s and tuned.rows[0].bandwidth_hz == before.bandwidth_hz
 
 
 def test_the_measured_shaft_is_put_into_the_loop():
