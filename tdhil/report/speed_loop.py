@@ -498,7 +498,7 @@ def loop_report(document: Part) -> Report:
             "green", f"P = {gain_words(tuned['gain_nm_s_rad'])} N·m·s/rad, "
             f"I = {gain_words(tuned['integral_nm_rad'])} N·m/rad", ("at the motor shaft",),
             f"keeps {_number(worst['phase_deg'], 0)}° and {_number(worst['gain_db'], 1)} dB in the worst case"
-            + (" while the backlash is closed" if "TDH-066" in document["warning_codes"] else ""),
+            + (" while the backlash is closed" if MessageCode.LOOP_GAP_OPEN.code in document["warning_codes"] else ""),
             document["sentence"], ""),
         warnings=tuple(map(with_code, document["warnings"], document["warning_codes"])),
         sections=tuple(sections),
