@@ -69,9 +69,10 @@ class CommandParser(argparse.ArgumentParser):
         """
         if self.usual_action and args is not None:
             from tdhil.cli.arguments import meant
+            from tdhil.config import OPTION
 
             actions = next(one for one in self._actions if isinstance(one, argparse._SubParsersAction))
-            if all(word == "--json" for word in args):
+            if all(word == OPTION["json"].flag for word in args):
                 raise self._refusal(f"an action is missing: {', '.join(actions.choices)}", MessageCode.USAGE)
             if args[0] not in {*actions.choices, "-h", "--help", HELP_ALL}:
                 word = args[0]
