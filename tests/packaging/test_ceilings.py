@@ -21,7 +21,7 @@ CEILINGS = {
     "tdhil/fleet": (2_200, "0089"),
     "tdhil/recording": (5_400, FIRST),
     "tdhil/report": (7_050, "0093"),
-    "tdhil/runner": (12_000, FIRST),
+    "tdhil/runner": (12_100, "0094"),
     "tdhil/service": (12_200, "0093"),
     "tdhil/session": (4_500, FIRST),
     "tdhil/soft_torque": (6_150, "0093"),
