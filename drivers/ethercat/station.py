@@ -69,7 +69,7 @@ class AlStatus(NamedTuple):
         return state_name(self.state) + (f", AL status code {self.code:04X}h ({meaning})" if self.error else "")
 
 
-class Fmmu(NamedTuple):
+class ActiveFmmu(NamedTuple):
     """Active fieldbus memory management unit: it maps logical addresses to the slave's memory, in bytes.
 
     ``kind``: `READS` (inputs) or `WRITES` (outputs).
@@ -80,7 +80,7 @@ class Fmmu(NamedTuple):
     physical: int
     kind: int
 
-    def overlaps(self, other: Fmmu) -> bool:
+    def overlaps(self, other: ActiveFmmu) -> bool:
         """Return whether both map a common logical address."""
         return self.logical < other.logical + other.length and other.logical < self.logical + self.length
 
@@ -157,10 +157,10 @@ class Station(ABC):
         data = self.read(SYNC_MANAGERS + number * SYNC_MANAGER_BYTES, 5)
         return int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little"), data[4]
 
-    def fmmus(self) -> list[Fmmu]:
+    def fmmus(self) -> list[ActiveFmmu]:
         """Return the active FMMUs."""
         data = self.read(FMMUS, self.number(FMMU_COUNT, 1) * FMMU_BYTES)
-        return [Fmmu(*values) for *values, active in _FMMU.iter_unpack(data) if active & 1]
+        return [ActiveFmmu(*values) for *values, active in _FMMU.iter_unpack(data) if active & 1]
 
 
 def not_answered(what: str, place: str) -> CommunicationLost:

@@ -170,7 +170,7 @@ class _ExcitationWave:
         return self.mean_rad_s + DITHER_COUNTS * self._resolution_rad_s * math.sin(turn)
 
 
-_POINTS = 1024
+_POINTS = 1024               # of a period, at which a peak is sought
 _GRID = np.exp(2j * np.pi * np.outer(np.arange(_POINTS), HARMONICS) / _POINTS)
 BETWEEN = math.cos(math.pi * max(HARMONICS) / _POINTS)
 """Least share of its peak that a sum of these harmonics reaches on the grid, whose points are within π/`_POINTS` of any
