@@ -91,7 +91,7 @@ def draw_bode(figure: FigureBase, found: Part) -> None:
     """Draw |ω/T| with noise and distortion below it, and the phase."""
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     _magnitude(top, found, "each line by itself", DARK)
-    _phase(below, found, DARK)
+    _phase(below, found, DARK, OURS)
     _finish((top, below))
     top.legend(fontsize="small", loc="best", ncols=2)
 
@@ -112,7 +112,7 @@ def draw_faults(figure: FigureBase, found: Part) -> None:
     """Draw the two panels that show faults: |ω/T| with noise and distortion, and the apparent inertia."""
     axes = figure.subplots(2, 1, sharex=True)
     _magnitude(axes[0], found, "each line by itself", DARK)
-    _inertia(axes[1], found, DARK)
+    _inertia(axes[1], found, DARK, OURS)
     _finish(axes)
     axes[0].legend(fontsize="small", loc="best", ncols=2)
 
@@ -124,9 +124,10 @@ def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> Non
     axes = figure.subplots(5, 1, sharex=True, height_ratios=(3, 2, 3, 1, 1))
     for number, (name, found) in enumerate(parts):
         colour = _COLOURS[number % len(_COLOURS)]
+        fitted = OURS if len(parts) == 1 else colour
         _magnitude(axes[0], found, name, colour, alone=len(parts) == 1)
-        _phase(axes[1], found, colour)
-        _inertia(axes[2], found, colour)
+        _phase(axes[1], found, colour, fitted)
+        _inertia(axes[2], found, colour, fitted)
         axes[4].plot([line["hertz"] for line in found["lines"]], [line["coherence"] for line in found["lines"]], "o",
                      color=colour, ms=4)
         shown = [line for line in found["lines"] if line["residual_sd"] is not None]
@@ -181,15 +182,16 @@ def _magnitude(axes: Axes, found: Part, name: str, colour: str, alone: bool = Tr
     axes.set_ylabel("|ω/T|, rad/(s·N·m)")
 
 
-def _phase(axes: Axes, found: Part, colour: str) -> None:
+def _phase(axes: Axes, found: Part, colour: str, fitted: str) -> None:
+    """Draw the lines in ``colour``, and the model with its band in ``fitted``."""
     curve = found["curve"]
     if curve:
         hertz = [point["hertz"] for point in curve]
         middle = _unwrapped([point["phase_rad"]["value"] for point in curve])
         half = [math.degrees(point["phase_rad"]["high"] - point["phase_rad"]["value"]) for point in curve]
         axes.fill_between(hertz, [m - h for m, h in zip(middle, half, strict=True)],
-                          [m + h for m, h in zip(middle, half, strict=True)], color=OURS, alpha=0.25, lw=0)
-        axes.plot(hertz, middle, color=OURS, lw=1.3)
+                          [m + h for m, h in zip(middle, half, strict=True)], color=fitted, alpha=0.25, lw=0)
+        axes.plot(hertz, middle, color=fitted, lw=1.3)
     lines = found["lines"]
     middle = _unwrapped([line["phase_rad"]["value"] for line in lines])
     half = [math.degrees(line["phase_rad"]["high"] - line["phase_rad"]["value"]) for line in lines]
@@ -197,13 +199,12 @@ def _phase(axes: Axes, found: Part, colour: str) -> None:
     axes.set_ylabel("phase of ω/T, °")
 
 
-def _inertia(axes: Axes, found: Part, colour: str) -> None:
+def _inertia(axes: Axes, found: Part, colour: str, fitted: str) -> None:
     curve = found["curve"]
     if curve:
         hertz = [point["hertz"] for point in curve]
-        axes.fill_between(hertz, *_band(curve, "apparent_inertia_kg_m2"), color=OURS, alpha=0.25, lw=0)
-        axes.plot(hertz, [point["apparent_inertia_kg_m2"]["value"] for point in curve],
-                  color=OURS, lw=1.3)
+        axes.fill_between(hertz, *_band(curve, "apparent_inertia_kg_m2"), color=fitted, alpha=0.25, lw=0)
+        axes.plot(hertz, [point["apparent_inertia_kg_m2"]["value"] for point in curve], color=fitted, lw=1.3)
     _errors(axes, found["lines"], "apparent_inertia_kg_m2", colour, None)
     axes.set_ylabel("Im(T/ω) / 2πf, kg·m²")
 

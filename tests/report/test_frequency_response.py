@@ -10,7 +10,7 @@ import pytest
 from tdhil.estimation import identify
 from tdhil.report.blocks import Picture, report_of
 from tdhil.report.document import result_document
-from tdhil.report.frequency_response import response_sentences
+from tdhil.report.frequency_response import draw_responses, response_sentences
 from tests.estimation.analytic import closed_form
 from tests.estimation.test_frequency_response import with_torque
 from tests.report.findings import RUN
@@ -41,3 +41,18 @@ def test_a_second_set_of_phases_is_advised_for_distortion(distorted, sets, advis
     response = document["frequency_response"]
     assert (response["distortion"]["detected"], response["realisations"]) == (distorted, 1)
     assert (ADVICE in " ".join(response_sentences(response | {"realisations": sets}))) is advised
+
+
+def test_each_of_several_logs_has_its_own_colour_in_every_panel():
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
+
+    found = measured(False)[1]["frequency_response"]
+    figure = Figure()
+    draw_responses(figure, [("one", found), ("two", found), ("three", found)])
+    for axes in figure.axes[:3]:
+        curves = [line for line in axes.lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 20]
+        bands = [to_hex(one.get_facecolor()[0]) for one in axes.collections if isinstance(one, PolyCollection)]
+        assert len({to_hex(line.get_color()) for line in curves}) == len(curves) == 3, axes.get_ylabel()
+        assert len(set(bands)) == len(bands) == 3, axes.get_ylabel()
