@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text as Words
 
-from tdhil.report.document import SIMULATED
+from tdhil.report.document import SIMULATED, coded_warnings
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import CAPTION_SIGNS, DARK, OURS, PAPER, PNG_DPI, QUIET, level_ticks
@@ -38,9 +38,12 @@ def response_sentences(found: Part) -> tuple[str, ...]:
     known = [half for half in halves if half is not None]
     said = []
     if known:
-        open_lines = len(halves) - len(known)
-        said.append(f"|ω/T| is known to ±{min(known):.2g} % at the best and ±{max(known):.2g} % at the worst of "
-                    f"{len(lines)} lines" + (f"; {open_lines} are below the noise." if open_lines else "."))
+        below = len(halves) - len(known)
+        where = (f"±{min(known):.2g} % at the best and ±{max(known):.2g} % at the worst of {len(lines)} lines"
+                 if len(known) > 1 else f"±{known[0]:.2g} % at one of {len(lines)} lines" if below
+                 else f"±{known[0]:.2g} % at the only line")
+        said.append(f"|ω/T| is known to {where}" + (f"; {below} {'is' if below == 1 else 'are'} below the noise."
+                                                    if below else "."))
     else:
         said.append("All lines are below the noise. Raise --amplitude or --periods.")
     harmonics, speeds = len(distortion["harmonics"]), len(found["mean_speeds_rad_s"])
@@ -238,11 +241,19 @@ def _unwrapped(phases_rad: Sequence[float]) -> list[float]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Table on a terminal, in 80 columns
+# Table on a terminal, in 80 columns; in a narrower one, as two tables below each other
+
+_COLUMNS = (("Hz", 8), ("|ω/T|", 9), ("±%", 7), ("phase °", 7), ("±°", 6), ("kg·m²", 9), ("noise%", 6), ("dist.%", 6),
+            ("coh.", 5), ("resid.", 6))
+_WHOLE = sum(width + 1 for _, width in _COLUMNS) - 1
+_STACKED = ((0, 1, 2, 3, 4), (0, 5, 6, 7, 8, 9))        # columns of the two tables
 
 
 def print_responses(responses: Sequence[Part], console: Console) -> None:
-    """Print each log's response as a table with sentences; if a log has no response, print the reason."""
+    """Print each log's response as a table with sentences and warnings; if a log has no response, print the reason.
+
+    The legend of the tables follows once, at the end.
+    """
     for number, one in enumerate(responses):
         if number:
             console.print()
@@ -251,25 +262,37 @@ def print_responses(responses: Sequence[Part], console: Console) -> None:
         found = one["frequency_response"]
         if found is None:
             console.print(f"none: {one['reason']}")
-            continue
-        percent = f"{100.0 * found['confidence']:g}"
-        console.print(Words(f"{'Hz':>8} {'|ω/T|':>9} {'±%':>7} {'phase °':>7} {'±°':>6} {'kg·m²':>9} {'noise%':>6} "
-                            f"{'dist.%':>6} {'coh.':>5} {'resid.':>6}", style="dim"))
-        for line in found["lines"]:
-            console.print(_row(line))
-        console.print(Words(f"± is half the {percent} % interval, torque scale taken as exact. kg·m²: apparent "
-                            "inertia Im(T/ω)/2πf. noise, dist.: standard uncertainty by noise and by distortion. "
-                            "coh.: coherence of speed and torque. "
-                            f"resid.: in standard deviations from the model ({found['model']}).", style="dim"))
-        for sentence in response_sentences(found):
-            console.print(sentence)
+        else:
+            _print_lines(found, console)
+            for sentence in response_sentences(found):
+                console.print(sentence)
+        for warning in coded_warnings(one):
+            console.print(Words(f"! {warning}", style="yellow"))
+    if any(one["frequency_response"] for one in responses):
+        console.print()
+        console.print(Words("± is half the interval, torque scale taken as exact. kg·m²: apparent inertia Im(T/ω)/2πf. "
+                            "noise, dist.: standard uncertainty by noise and by distortion; –: no distortion was "
+                            "detected. coh.: coherence of speed and torque. resid.: in standard deviations from the "
+                            "model.", style="dim"))
 
 
-def _row(line: Part) -> str:
+def _print_lines(found: Part, console: Console) -> None:
+    """Print the lines as a table, and below it the confidence and the model."""
+    rows = [_row(line, found["distortion"]["detected"]) for line in found["lines"]]
+    for columns in (range(len(_COLUMNS)),) if console.width >= _WHOLE else _STACKED:
+        console.print(Words(" ".join(f"{_COLUMNS[at][0]:>{_COLUMNS[at][1]}}" for at in columns), style="dim"))
+        for row in rows:
+            console.print(" ".join(f"{row[at]:>{_COLUMNS[at][1]}}" for at in columns))
+    model = "no model is fitted" if found["model"] == "none" else f"model: {found['model']}"
+    console.print(Words(f"{100.0 * found['confidence']:g} % intervals; {model}", style="dim"))
+
+
+def _row(line: Part, distorted: bool) -> list[str]:
+    """Return the cells of a line, in the order of `_COLUMNS`."""
     half, turn = _half_rel(line), math.degrees(line["phase_rad"]["high"] - line["phase_rad"]["value"])
     residual = line["residual_sd"]
-    return (f"{line['hertz']:>8.4g} {line['magnitude']['value']:>9.4g} "
-            f"{'open' if half is None else f'{half:.2g}':>7} {math.degrees(line['phase_rad']['value']):>7.1f} "
-            f"{turn:>6.2g} {line['apparent_inertia_kg_m2']['value']:>9.5g} {100.0 * line['noise_rel']:>6.2g} "
-            f"{100.0 * line['distortion_rel']:>6.2g} {line['coherence']:>5.3f} "
-            f"{'–' if residual is None else f'{residual:.2g}':>6}")
+    return [f"{line['hertz']:.4g}", f"{line['magnitude']['value']:.4g}", "open" if half is None else f"{half:.2g}",
+            f"{math.degrees(line['phase_rad']['value']):.1f}", f"{turn:.2g}",
+            f"{line['apparent_inertia_kg_m2']['value']:.5g}", f"{100.0 * line['noise_rel']:.2g}",
+            f"{100.0 * line['distortion_rel']:.2g}" if distorted else "–", f"{line['coherence']:.3f}",
+            "–" if residual is None else f"{residual:.2g}"]
