@@ -127,7 +127,7 @@ def live_text() -> str:
 
     parts = [_until(recording("loose"), end_s) for end_s in LIVE_S]
     console = Console(file=io.StringIO(), width=80)
-    console.print(Group(*inertia_rows([live_inertia(identify(part), part, 0.95) for part in parts])))
+    console.print(Group(*inertia_rows([live_inertia(identify(part), part, 0.95) for part in parts], 80)))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     return "\n".join(line.rstrip() for line in text.splitlines() if not line.startswith(("Good:", "Bad:")))
 
