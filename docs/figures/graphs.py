@@ -127,14 +127,50 @@ def live_text() -> str:
 
     parts = [_until(recording("loose"), end_s) for end_s in LIVE_S]
     console = Console(file=io.StringIO(), width=80)
-    console.print(Group(*inertia_rows([live_inertia(identify(part), part, 0.95) for part in parts])))
+    console.print(Group(*inertia_rows([live_inertia(identify(part), part, 0.95) for part in parts], 80)))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     return "\n".join(line.rstrip() for line in text.splitlines() if not line.startswith(("Good:", "Bad:")))
 
 
-def with_live(page: str, text: str) -> str:
+def _card_rows(*harmonics: tuple[int, float, float], play_rad: float = 0.0) -> str:
+    """Return the rows of the card on torque over angle and backlash, and the warnings on backlash, in 80 columns.
+
+    ``harmonics``: order, amplitude in N·m and phase in rad of each; ``play_rad``: of a coupling before 40 kg·m².
+    """
+    from rich.console import Console
+
+    from tdhil.estimation import identify
+    from tdhil.report import result_document
+    from tdhil.report.card import backlash_rows, harmonic_rows
+    from tdhil.report.console import names_and_texts
+    from tests.estimation.angle_bench import OverAngle, run_over_angle
+    from tests.estimation.shaft_bench import Rig
+    from tests.estimation.stages_bench import Play
+
+    play = Play(play_rad, 40.0, 20.0, viscous=2.0) if play_rad else None
+    (found,) = run_over_angle(OverAngle(rig=Rig(harmonics=harmonics), play=play), [0])
+    document = result_document(identify(found), found, {}, "run.mcap")
+    console = Console(file=io.StringIO(), width=80)
+    console.print(names_and_texts((*harmonic_rows(document), *backlash_rows(document))))
+    for warning in document["warnings"]:
+        if warning.startswith("backlash"):
+            console.print(f"! {warning}", markup=False)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in text.splitlines())
+
+
+TEXTS: dict[str, Callable[[], str]] = {
+    "live": live_text,
+    "angle_good": partial(_card_rows, (6, 6.0, 0.7)),
+    "angle_bad": partial(_card_rows, (1, 40.0, 0.7), (6, 6.0, 0.7)),
+    "backlash": partial(_card_rows, play_rad=0.02),
+}
+"""Text on the page that the program makes, below a mark with its name."""
+
+
+def with_text(page: str, name: str, text: str) -> str:
     """Return the page with the text in the block below its mark."""
-    return re.sub(r"(?<=<!-- live -->\n```text\n).*?(?=\n```\n)", lambda _: text, page, flags=re.DOTALL)
+    return re.sub(rf"(?<=<!-- {name} -->\n```text\n).*?(?=\n```\n)", lambda _: text, page, flags=re.DOTALL)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -435,11 +471,11 @@ def picture(name: str) -> str:
 
 
 def main(names: Sequence[str]) -> int:
-    """Draw the named pictures, or all; ``live`` writes J during a run into the page."""
-    if not names or "live" in names:
-        PAGE.write_text(with_live(PAGE.read_text(encoding="utf-8"), live_text()), encoding="utf-8")
-        print("docs/reference/graphs.md: live", flush=True)
-    for name in [name for name in names if name != "live"] or ([] if names else PICTURES):
+    """Draw the named pictures and write the named texts into the page, or all of both."""
+    for name in [name for name in names or TEXTS if name in TEXTS]:
+        PAGE.write_text(with_text(PAGE.read_text(encoding="utf-8"), name, TEXTS[name]()), encoding="utf-8")
+        print(f"docs/reference/graphs.md: {name}", flush=True)
+    for name in [name for name in names or PICTURES if name not in TEXTS]:
         path = IMAGES / f"graph_{name}.svg"
         path.write_text(picture(name), encoding="utf-8")
         print(f"docs/images/{path.name}: {path.stat().st_size} bytes", flush=True)

@@ -71,8 +71,9 @@ def write_entries(objects: Objects, index: int, entries: Sequence[int], bits: in
 class CyclicLayout:
     """Places of some objects in cyclic data. ``size``: length of the data, bytes.
 
-    ``mapped``: content of the data, in its order. ``wanted``: the objects whose values are packed and unpacked; None,
-    and an object that is not mapped on whole bytes, have no place. ``kinds``: types that do not follow from the length.
+    ``mapped`` (kept in ``content``): content of the data, in its order. ``wanted``: the objects whose values are packed
+    and unpacked; None, and an object that is not mapped on whole bytes, have no place. ``kinds``: types that do not
+    follow from the length.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class CyclicLayout:
         kinds: Mapping[Mapped, ObjectType] | None = None,
     ) -> None:
         self._at: dict[Mapped, int] = {}
+        self.content = tuple(mapped)
         bits = 0
         for one in mapped:
             if one[0] and bits % 8 == 0:

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from drivers.errors import ObjectRefused
+from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.undo_journal import UndoJournal, Undos
 
 MAPPING_FIRST, MAPPING_LAST = 0x1400, 0x1C1F
@@ -111,6 +111,16 @@ class Objects(ABC):
 
             self._undos.add([where], give_back)
             self._mapping = []
+
+    def check_stands(self) -> None:
+        """Refuse a drive in which a setting that was made or relied on has changed since. Raises PreflightRefused."""
+        wanted = {key: data for key, (_, data) in self.relied_on.items()} | self.stands
+        for (index, subindex), data in wanted.items():
+            found = self.read_bytes(index, subindex)
+            if found != data:
+                was, is_now = (int.from_bytes(one, "little") for one in (data, found))
+                raise PreflightRefused(f"the value changed from {was} to {is_now} when the bus was started anew",
+                                       where=name(index, subindex), next_step="Start again")
 
     def on_restore(self, undo: Callable[[], None]) -> None:
         """Register ``undo``, which `restore` calls.

@@ -12,8 +12,9 @@ of the cycle, and the ticks of this loop follow the clock of the segment.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 
 from drivers import cia402
 from drivers.clock import Clock
@@ -39,6 +40,8 @@ ANSWER_SHARE, CYCLE_SHARE = 0.5, 0.2
 SYNC0_SHARE = 0.5
 """Distance of SYNC0 behind the frame, as a share of the period: as far from the frames as possible on both sides."""
 NO_SETPOINTS = cia402.CycleSetpoints(0, 0, 0, 0, 0, False)
+Layouts = tuple[cia402.CyclicLayout, cia402.CyclicLayout]
+"""Places of the setpoints and of the feedback."""
 SETPOINTS, FEEDBACK = 2, 3
 """Identifiers of the process data in the log: the sync managers."""
 
@@ -67,6 +70,7 @@ class EthercatBus(cia402.Cia402Bus):
         self._setpoints = NO_SETPOINTS
         self._outputs = cia402.CyclicLayout((), ())
         self._inputs: cia402.CyclicLayout | None = None     # None: nothing can be decoded
+        self._assign: Callable[[], Layouts]                 # set by `map_cyclic`
         self._asked, self._looked_s, self._al_state = 0, 0.0, OP
         self._sent, self._fed, self._clocks = False, True, False
 
@@ -96,9 +100,12 @@ class EthercatBus(cia402.Cia402Bus):
         """Map and assign the PDOs, in PRE-OP."""
         self._setpoints, self.angle_mapped = NO_SETPOINTS, False
 
+        def assign(angle: Position | None) -> Layouts:
+            self._assign = partial(map_cyclic, self.objects, self._profile, content, demand, angle)
+            return self._assign()
+
         def work() -> tuple[str, bool]:
-            (self._outputs, inputs), done = cia402.with_angle(
-                table, position, lambda angle: map_cyclic(self.objects, self._profile, content, demand, angle))
+            (self._outputs, inputs), done = cia402.with_angle(table, position, assign)
             angle, self._inputs = cia402.angle_object(position), inputs
             self.angle_mapped = angle is not None and not inputs.missing([angle])
             return done, True
@@ -133,12 +140,12 @@ class EthercatBus(cia402.Cia402Bus):
             return                                     # the mapping was refused: nothing may move
         self._setpoints = self._setpoints.stopped(0)
         try:
-            self._segment.map(self._outputs.size, self._inputs.size)
+            self._segment.map(self._outputs.size, self._inputs.size, self._assign_again)
             if self._clocks:
                 self._segment.master.config_dc()
                 self._segment.slave.dc_sync(True, round(self.period_s * 1e9))
             self._station.reach(SAFE_OP)
-            self._watchdog.check_trigger()
+            self._watchdog.check()
             self._station.reach(OP, self._frame)
             self._al_state = OP
         except DriveFault as error:                    # nothing moves yet: an error becomes a refusal
@@ -147,6 +154,19 @@ class EthercatBus(cia402.Cia402Bus):
         in_cycle_us = min(CYCLE_US, round(CYCLE_SHARE * self.period_s * 1e6))
         self._station.wait_us = REGISTER_US if self.clock.stepped else in_cycle_us
         self._slave_watch.start(cia402.DRIVE_SILENT_S)
+
+    def _assign_again(self) -> None:
+        """Assign the PDOs after a second start of the segment. All settings must stand, and all places be the same.
+
+        Raises PreflightRefused.
+        """
+        self._station.reach(PRE_OP)
+        self._mailbox.find()
+        before = [one and one.content for one in (self._outputs, self._inputs)]
+        if [one.content for one in self._assign()] != before:
+            raise PreflightRefused("the drive has other process data after a second start of the segment",
+                                   where=self.place, next_step="Start again", entry=MessageCode.PDO_NOT_POSSIBLE)
+        self.objects.check_stands()
 
     def set_period(self, period_s: float) -> Sequence[tuple[int, int, bytes]]:
         """Change the period in PRE-OP, with 60C2h."""
@@ -207,16 +227,20 @@ class EthercatBus(cia402.Cia402Bus):
         return cia402.CycleInputs(age_s, True, False, status, torque, speed, angle)
 
     def _transmit(self) -> None:
+        self._sent = True
+        if not self._segment.mapped:                   # pysoem would write to no memory
+            return
         data = self._outputs.pack(self._setpoints)
         self._segment.slave.output = data
         self._seen(True, SETPOINTS, data)
         self._segment.master.send_processdata()
-        self._sent = True
 
     def _take(self) -> bytes | None:
         """Return the inputs of the frame that was sent; None with a wrong working counter."""
         self._sent = False
         master = self._segment.master
+        if not self._segment.mapped:
+            return None
         wait_us = STEPPED_ANSWER_US if self.clock.stepped else round(ANSWER_SHARE * self.period_s * 1e6)
         if master.receive_processdata(wait_us) != master.expected_wkc:
             return None

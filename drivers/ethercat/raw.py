@@ -25,7 +25,7 @@ ETHERCAT = 0x88A4
 """Type of an Ethernet frame."""
 APRD, APWR, BRD = 1, 2, 7
 """Commands: read and write by position, read from all slaves."""
-ANSWER_S, TRIES = 0.05, 3
+ANSWER_S, TRIES = 0.05, 5
 """Waiting time for a frame that comes back, s, and number of attempts."""
 _HEADER, _DATAGRAM = struct.Struct("<6s6s2s"), struct.Struct("<BBHHHH")
 _LEAST = 60
@@ -109,12 +109,14 @@ class RawStation(Station):
             raise not_answered(f"the slave does not take {offset:04X}h", self.place)
 
 
-def refuse_driven(segment: RawSegment) -> None:
-    """Refuse a segment on which a slave is in OP: another master drives it. Nothing is written.
+def refuse_driven(segment: RawSegment) -> int:
+    """Refuse a segment on which a slave is in OP: another master drives it. Nothing is written. Return the number of
+    slaves.
 
     A host that died leaves SAFE-OP behind, where a slave takes no setpoints. Raises PreflightRefused.
     """
-    for station in segment.stations():
+    stations = segment.stations()
+    for station in stations:
         found = station.al_status()
         if found.state == OP:
             raise PreflightRefused(
@@ -122,6 +124,7 @@ def refuse_driven(segment: RawSegment) -> None:
                 next_step="Stop that master. Nothing was written: tdhil would set all slaves to INIT",
                 entry=MessageCode.ANOTHER_MASTER,
             )
+    return len(stations)
 
 
 def unusable(interface: str, error: Exception) -> PreflightRefused:

@@ -10,6 +10,7 @@ Source: ETG.1000.4 (data link layer: registers), ETG.1000.6 (application layer: 
 
 from __future__ import annotations
 
+import struct
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -23,6 +24,10 @@ AL_CONTROL, AL_STATUS = 0x0120, 0x0130
 SYNC_MANAGERS, SYNC_MANAGER_BYTES = 0x0800, 8
 """Address of the first sync manager's registers, and their length, bytes: start address u16, length u16, control u8,
 status u8, activation u8, PDI control u8."""
+FMMU_COUNT, FMMUS, FMMU_BYTES = 0x0004, 0x0600, 16
+"""Register with the number of FMMUs, address of the first one's registers, and their length, bytes."""
+READS, WRITES = 1, 2
+"""Types of an FMMU: the master reads inputs, or writes outputs."""
 HAS_CLOCKS = 1 << 2
 """Bit of 0008h: the slave controller has distributed clocks."""
 
@@ -36,6 +41,7 @@ cycle."""
 STATE_S = 5.0
 """Longest time for a change of the AL state, s; ETG.1020 allows 10 s for SAFE-OP to OP and 5 s for the others."""
 _PAUSE_S = 0.002
+_FMMU = struct.Struct("<IHxxHxBB3x")
 
 _CODES = {
     0x0000: "no error", 0x0001: "unspecified error", 0x0011: "invalid requested state change",
@@ -61,6 +67,22 @@ class AlStatus(NamedTuple):
         """The state in words, with the AL status code if there is an error."""
         meaning = _CODES.get(self.code, "see the manual of the drive")
         return state_name(self.state) + (f", AL status code {self.code:04X}h ({meaning})" if self.error else "")
+
+
+class ActiveFmmu(NamedTuple):
+    """Active fieldbus memory management unit: it maps logical addresses to the slave's memory, in bytes.
+
+    ``kind``: `READS` (inputs) or `WRITES` (outputs).
+    """
+
+    logical: int
+    length: int
+    physical: int
+    kind: int
+
+    def overlaps(self, other: ActiveFmmu) -> bool:
+        """Return whether both map a common logical address."""
+        return self.logical < other.logical + other.length and other.logical < self.logical + self.length
 
 
 def state_name(state: int) -> str:
@@ -134,6 +156,11 @@ class Station(ABC):
         """Return start address, length in bytes, and control byte of a sync manager."""
         data = self.read(SYNC_MANAGERS + number * SYNC_MANAGER_BYTES, 5)
         return int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little"), data[4]
+
+    def fmmus(self) -> list[ActiveFmmu]:
+        """Return the active FMMUs."""
+        data = self.read(FMMUS, self.number(FMMU_COUNT, 1) * FMMU_BYTES)
+        return [ActiveFmmu(*values) for *values, active in _FMMU.iter_unpack(data) if active & 1]
 
 
 def not_answered(what: str, place: str) -> CommunicationLost:

@@ -100,8 +100,14 @@ class ProcessDataWatchdog:
     def _read(self) -> tuple[int, int]:
         return self._station.number(WATCHDOG_DIVIDER), self._station.number(WATCHDOG_TIME)
 
-    def check_trigger(self) -> None:
-        """Refuse a sync manager of the setpoints that does not trigger the watchdog. Raises PreflightRefused."""
+    def check(self) -> None:
+        """Refuse a watchdog that the start of the segment has changed, and a sync manager of the setpoints that does
+        not trigger it. Raises PreflightRefused.
+        """
+        if self._wanted is not None and self._read() != self._wanted:
+            raise PreflightRefused("the registers 0400h and 0420h of the watchdog have changed since they were written",
+                                   where=self._station.place, next_step="Start again",
+                                   entry=MessageCode.WATCHDOG_NOT_ARMED)
         if self._wanted is not None and not self._station.sync_manager(OUTPUT_MANAGER)[2] & WATCHDOG_TRIGGER:
             raise PreflightRefused(
                 "the setpoints do not trigger the watchdog: bit 6 of register 0814h is 0", where=self._station.place,

@@ -169,7 +169,8 @@ def _read(namespace: argparse.Namespace, wanted: Wanted) -> list[CalibrationRun]
 
     for path, _, _ in wanted:
         require_file(path)
-    return [CalibrationRun(read_recorded(namespace, path), added, sd) for path, added, sd in wanted]
+    paths = [path for path, _, _ in wanted]
+    return [CalibrationRun(read_recorded(namespace, path, paths), added, sd) for path, added, sd in wanted]
 
 
 def _plan(namespace: argparse.Namespace) -> int:

@@ -19,6 +19,7 @@ from tdhil.cli.results import print_json
 from tdhil.config import OPTION
 from tdhil.csv_text import cell_of
 from tdhil.errors import ExitCode, MessageCode, UsageError
+from tdhil.file_kind import require_log_kind
 from tdhil.new_file import whole_or_none
 from tdhil.session import is_evaluation, is_verification, require_file
 
@@ -58,10 +59,11 @@ def run(namespace: argparse.Namespace) -> int:
     check_trace(namespace)
     for path in logs:
         require_file(path)
+        require_log_kind(path, "tdhil frf run.mcap", trace=True)
     _check_targets(namespace, logs)
     found: list[Result] = []
     for path in logs:
-        recorded = read_recorded(namespace, path)
+        recorded = read_recorded(namespace, path, logs)
         if is_evaluation(recorded.configuration) or is_verification(recorded.configuration):
             raise UsageError("contains a virtual string or single steps, which have no frequency response",
                              where=str(path), next_step="Name the log of an identification",
@@ -111,8 +113,15 @@ def _check_targets(namespace: argparse.Namespace, logs: Sequence[Path]) -> None:
 
 def _part(result: Result) -> dict[str, Any]:
     """Return one log's response as plain data; without a response, ``reason`` states why."""
+    from tdhil.recording import aborted_stage
+
     document = result.document
-    part = {name: document[name] for name in ("log", "simulated", "frequency_response")}
+    part = {name: document[name] for name in ("log", "simulated", "frequency_response", "warnings", "warning_codes")}
+    stage = aborted_stage(result.record.recording)
+    if stage is not None and result.identification.inertia is None:        # else it is the first of the warnings
+        part["warnings"] = [f"the run was {stage.aborted_text}. The result uses the data recorded before",
+                            *part["warnings"]]
+        part["warning_codes"] = [MessageCode.RUN_ENDED_EARLY.code, *part["warning_codes"]]
     excitation, found = result.record.recording.excitation, result.identification
     if part["frequency_response"] is not None:
         reason = None
@@ -128,14 +137,18 @@ def _part(result: Result) -> dict[str, Any]:
 
 
 def _write_table(found: Sequence[Result], path: Path) -> None:
-    """Write a row for each line of each log. A CSV has all digits, and an empty cell for an unknown value."""
+    """Write a row for each line of each log. A CSV has all digits, and an empty cell for an unknown value.
+
+    ``distortion_detected``: 1 if distortion was detected in the log; with 0, ``distortion_rel`` is not significant.
+    """
     from tdhil.estimation import response_columns
 
     rows: list[dict[str, Any]] = []
     for one in found:
         if (response := one.frf) is not None:
             columns = response_columns(response)
-            rows += [{"log": str(one.document["log"]), **dict(zip(columns, row, strict=True))}
+            detected = {"distortion_detected": float(response.distortion.detected)}
+            rows += [{"log": str(one.document["log"]), **dict(zip(columns, row, strict=True)), **detected}
                      for row in zip(*columns.values(), strict=True)]
     if not rows:
         return

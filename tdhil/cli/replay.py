@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,21 +96,22 @@ def run(namespace: argparse.Namespace) -> int:
     return _identify(namespace, recorded, report)
 
 
-def read_recorded(namespace: argparse.Namespace, path: Path) -> RunRecord:
-    """Return the content of a log, or of a trace by its options. Raises UsageError for options of a trace with a
-    log.
+def read_recorded(namespace: argparse.Namespace, path: Path, among: Sequence[Path] = ()) -> RunRecord:
+    """Return the content of a log, or of a trace by its options. ``among``: all files of the command, if several.
+
+    Raises UsageError for options of a trace if no file is one.
     """
     from tdhil.report import working
 
     trace: dict[str, Any] = {}
     if is_log(path):
-        for option in OF_A_TRACE:
-            if getattr(namespace, option.name) is not None:
-                raise UsageError("is for a trace in CSV; this log has its own", where=option.flag,
-                                 entry=MessageCode.OPTION_FOR_CSV_ONLY)
+        given = [option.flag for option in OF_A_TRACE if getattr(namespace, option.name) is not None]
+        if given and all(map(is_log, among)):
+            raise UsageError(f"is for a trace in CSV; {path} is a log of a run and contains its own", where=given[0],
+                             entry=MessageCode.OPTION_FOR_CSV_ONLY)
     else:
-        given = {option.name: getattr(namespace, option.name) for option in OF_A_TRACE}
-        trace = trace_arguments(given, "the command line")
+        options = {option.name: getattr(namespace, option.name) for option in OF_A_TRACE}
+        trace = trace_arguments(options, "the command line")
     with working("reading the record …"):
         return read(path, **trace)
 

@@ -79,7 +79,7 @@ def run(namespace: argparse.Namespace) -> int:
     configurations = []
     for path in paths:
         require_file(path)
-        recorded = read_recorded(namespace, path)
+        recorded = read_recorded(namespace, path, paths)
         warnings += [f"{path.name}: {one}" for one in (*(recorded.assumed or ()), *recorded.problems)]
         record, remarks = _surface(recorded.recording, result, namespace)
         warnings += remarks

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text as Words
 
-from tdhil.report.document import SIMULATED
+from tdhil.report.document import SIMULATED, coded_warnings
 from tdhil.report.graphs import GRAPHS
 from tdhil.report.page import repeatable_figures
 from tdhil.report.plots import CAPTION_SIGNS, DARK, OURS, PAPER, PNG_DPI, QUIET, level_ticks
@@ -38,9 +38,12 @@ def response_sentences(found: Part) -> tuple[str, ...]:
     known = [half for half in halves if half is not None]
     said = []
     if known:
-        open_lines = len(halves) - len(known)
-        said.append(f"|ω/T| is known to ±{min(known):.2g} % at the best and ±{max(known):.2g} % at the worst of "
-                    f"{len(lines)} lines" + (f"; {open_lines} are below the noise." if open_lines else "."))
+        below = len(halves) - len(known)
+        where = (f"±{min(known):.2g} % at the best and ±{max(known):.2g} % at the worst of {len(lines)} lines"
+                 if len(known) > 1 else f"±{known[0]:.2g} % at one of {len(lines)} lines" if below
+                 else f"±{known[0]:.2g} % at the only line")
+        said.append(f"|ω/T| is known to {where}" + (f"; {below} {'is' if below == 1 else 'are'} below the noise."
+                                                    if below else "."))
     else:
         said.append("All lines are below the noise. Raise --amplitude or --periods.")
     harmonics, speeds = len(distortion["harmonics"]), len(found["mean_speeds_rad_s"])
@@ -91,7 +94,7 @@ def draw_bode(figure: FigureBase, found: Part) -> None:
     """Draw |ω/T| with noise and distortion below it, and the phase."""
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     _magnitude(top, found, "each line by itself", DARK)
-    _phase(below, found, DARK)
+    _phase(below, found, DARK, OURS)
     _finish((top, below))
     top.legend(fontsize="small", loc="best", ncols=2)
 
@@ -112,7 +115,7 @@ def draw_faults(figure: FigureBase, found: Part) -> None:
     """Draw the two panels that show faults: |ω/T| with noise and distortion, and the apparent inertia."""
     axes = figure.subplots(2, 1, sharex=True)
     _magnitude(axes[0], found, "each line by itself", DARK)
-    _inertia(axes[1], found, DARK)
+    _inertia(axes[1], found, DARK, OURS)
     _finish(axes)
     axes[0].legend(fontsize="small", loc="best", ncols=2)
 
@@ -124,9 +127,10 @@ def draw_responses(figure: FigureBase, parts: Sequence[tuple[str, Part]]) -> Non
     axes = figure.subplots(5, 1, sharex=True, height_ratios=(3, 2, 3, 1, 1))
     for number, (name, found) in enumerate(parts):
         colour = _COLOURS[number % len(_COLOURS)]
+        fitted = OURS if len(parts) == 1 else colour
         _magnitude(axes[0], found, name, colour, alone=len(parts) == 1)
-        _phase(axes[1], found, colour)
-        _inertia(axes[2], found, colour)
+        _phase(axes[1], found, colour, fitted)
+        _inertia(axes[2], found, colour, fitted)
         axes[4].plot([line["hertz"] for line in found["lines"]], [line["coherence"] for line in found["lines"]], "o",
                      color=colour, ms=4)
         shown = [line for line in found["lines"] if line["residual_sd"] is not None]
@@ -181,15 +185,16 @@ def _magnitude(axes: Axes, found: Part, name: str, colour: str, alone: bool = Tr
     axes.set_ylabel("|ω/T|, rad/(s·N·m)")
 
 
-def _phase(axes: Axes, found: Part, colour: str) -> None:
+def _phase(axes: Axes, found: Part, colour: str, fitted: str) -> None:
+    """Draw the lines in ``colour``, and the model with its band in ``fitted``."""
     curve = found["curve"]
     if curve:
         hertz = [point["hertz"] for point in curve]
         middle = _unwrapped([point["phase_rad"]["value"] for point in curve])
         half = [math.degrees(point["phase_rad"]["high"] - point["phase_rad"]["value"]) for point in curve]
         axes.fill_between(hertz, [m - h for m, h in zip(middle, half, strict=True)],
-                          [m + h for m, h in zip(middle, half, strict=True)], color=OURS, alpha=0.25, lw=0)
-        axes.plot(hertz, middle, color=OURS, lw=1.3)
+                          [m + h for m, h in zip(middle, half, strict=True)], color=fitted, alpha=0.25, lw=0)
+        axes.plot(hertz, middle, color=fitted, lw=1.3)
     lines = found["lines"]
     middle = _unwrapped([line["phase_rad"]["value"] for line in lines])
     half = [math.degrees(line["phase_rad"]["high"] - line["phase_rad"]["value"]) for line in lines]
@@ -197,13 +202,12 @@ def _phase(axes: Axes, found: Part, colour: str) -> None:
     axes.set_ylabel("phase of ω/T, °")
 
 
-def _inertia(axes: Axes, found: Part, colour: str) -> None:
+def _inertia(axes: Axes, found: Part, colour: str, fitted: str) -> None:
     curve = found["curve"]
     if curve:
         hertz = [point["hertz"] for point in curve]
-        axes.fill_between(hertz, *_band(curve, "apparent_inertia_kg_m2"), color=OURS, alpha=0.25, lw=0)
-        axes.plot(hertz, [point["apparent_inertia_kg_m2"]["value"] for point in curve],
-                  color=OURS, lw=1.3)
+        axes.fill_between(hertz, *_band(curve, "apparent_inertia_kg_m2"), color=fitted, alpha=0.25, lw=0)
+        axes.plot(hertz, [point["apparent_inertia_kg_m2"]["value"] for point in curve], color=fitted, lw=1.3)
     _errors(axes, found["lines"], "apparent_inertia_kg_m2", colour, None)
     axes.set_ylabel("Im(T/ω) / 2πf, kg·m²")
 
@@ -237,11 +241,19 @@ def _unwrapped(phases_rad: Sequence[float]) -> list[float]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Table on a terminal, in 80 columns
+# Table on a terminal, in 80 columns; in a narrower one, as two tables below each other
+
+_COLUMNS = (("Hz", 8), ("|ω/T|", 9), ("±%", 7), ("phase °", 7), ("±°", 6), ("kg·m²", 9), ("noise%", 6), ("dist.%", 6),
+            ("coh.", 5), ("resid.", 6))
+_WHOLE = sum(width + 1 for _, width in _COLUMNS) - 1
+_STACKED = ((0, 1, 2, 3, 4), (0, 5, 6, 7, 8, 9))        # columns of the two tables
 
 
 def print_responses(responses: Sequence[Part], console: Console) -> None:
-    """Print each log's response as a table with sentences; if a log has no response, print the reason."""
+    """Print each log's response as a table with sentences and warnings; if a log has no response, print the reason.
+
+    The legend of the tables follows once, at the end.
+    """
     for number, one in enumerate(responses):
         if number:
             console.print()
@@ -250,25 +262,37 @@ def print_responses(responses: Sequence[Part], console: Console) -> None:
         found = one["frequency_response"]
         if found is None:
             console.print(f"none: {one['reason']}")
-            continue
-        percent = f"{100.0 * found['confidence']:g}"
-        console.print(Words(f"{'Hz':>8} {'|ω/T|':>9} {'±%':>7} {'phase °':>7} {'±°':>6} {'kg·m²':>9} {'noise%':>6} "
-                            f"{'dist.%':>6} {'coh.':>5} {'resid.':>6}", style="dim"))
-        for line in found["lines"]:
-            console.print(_row(line))
-        console.print(Words(f"± is half the {percent} % interval, torque scale taken as exact. kg·m²: apparent "
-                            "inertia Im(T/ω)/2πf. noise, dist.: standard uncertainty by noise and by distortion. "
-                            "coh.: coherence of speed and torque. "
-                            f"resid.: in standard deviations from the model ({found['model']}).", style="dim"))
-        for sentence in response_sentences(found):
-            console.print(sentence)
+        else:
+            _print_lines(found, console)
+            for sentence in response_sentences(found):
+                console.print(sentence)
+        for warning in coded_warnings(one):
+            console.print(Words(f"! {warning}", style="yellow"))
+    if any(one["frequency_response"] for one in responses):
+        console.print()
+        console.print(Words("± is half the interval, torque scale taken as exact. kg·m²: apparent inertia Im(T/ω)/2πf. "
+                            "noise, dist.: standard uncertainty by noise and by distortion; –: no distortion was "
+                            "detected. coh.: coherence of speed and torque. resid.: in standard deviations from the "
+                            "model.", style="dim"))
 
 
-def _row(line: Part) -> str:
+def _print_lines(found: Part, console: Console) -> None:
+    """Print the lines as a table, and below it the confidence and the model."""
+    rows = [_row(line, found["distortion"]["detected"]) for line in found["lines"]]
+    for columns in (range(len(_COLUMNS)),) if console.width >= _WHOLE else _STACKED:
+        console.print(Words(" ".join(f"{_COLUMNS[at][0]:>{_COLUMNS[at][1]}}" for at in columns), style="dim"))
+        for row in rows:
+            console.print(" ".join(f"{row[at]:>{_COLUMNS[at][1]}}" for at in columns))
+    model = "no model is fitted" if found["model"] == "none" else f"model: {found['model']}"
+    console.print(Words(f"{100.0 * found['confidence']:g} % intervals; {model}", style="dim"))
+
+
+def _row(line: Part, distorted: bool) -> list[str]:
+    """Return the cells of a line, in the order of `_COLUMNS`."""
     half, turn = _half_rel(line), math.degrees(line["phase_rad"]["high"] - line["phase_rad"]["value"])
     residual = line["residual_sd"]
-    return (f"{line['hertz']:>8.4g} {line['magnitude']['value']:>9.4g} "
-            f"{'open' if half is None else f'{half:.2g}':>7} {math.degrees(line['phase_rad']['value']):>7.1f} "
-            f"{turn:>6.2g} {line['apparent_inertia_kg_m2']['value']:>9.5g} {100.0 * line['noise_rel']:>6.2g} "
-            f"{100.0 * line['distortion_rel']:>6.2g} {line['coherence']:>5.3f} "
-            f"{'–' if residual is None else f'{residual:.2g}':>6}")
+    return [f"{line['hertz']:.4g}", f"{line['magnitude']['value']:.4g}", "open" if half is None else f"{half:.2g}",
+            f"{math.degrees(line['phase_rad']['value']):.1f}", f"{turn:.2g}",
+            f"{line['apparent_inertia_kg_m2']['value']:.5g}", f"{100.0 * line['noise_rel']:.2g}",
+            f"{100.0 * line['distortion_rel']:.2g}" if distorted else "–", f"{line['coherence']:.3f}",
+            "–" if residual is None else f"{residual:.2g}"]

@@ -324,17 +324,17 @@ class LiveDisplay:
             self._live = Live(console=self._console, auto_refresh=False, transient=False)
             self._live.start()
         if self._live is not None:
-            self._live.update(picture(view), refresh=True)
+            self._live.update(picture(view, self._console.width), refresh=True)
 
     def _release_picture(self, view: LiveView) -> None:
         if self._live is not None:
-            self._live.update(picture(view), refresh=True)
+            self._live.update(picture(view, self._console.width), refresh=True)
             self._live.stop()
             self._live = None
 
 
-def picture(view: LiveView) -> RenderableType:
-    """Return stages, bars, speed and torque."""
+def picture(view: LiveView, width: int) -> RenderableType:
+    """Return stages, bars, speed and torque; ``width``: available columns."""
     table = Table.grid(padding=(0, 1))
     table.add_column(width=1)
     table.add_column(width=8)
@@ -364,7 +364,7 @@ def picture(view: LiveView) -> RenderableType:
         )
         parts.append(Text(text, no_wrap=True, overflow="ellipsis"))
     if view.inertias and not view.end:
-        parts += inertia_rows(view.inertias)
+        parts += inertia_rows(view.inertias, width)
     if view.simulated:
         parts.insert(0, Text(f"{SIMULATED} drive and rig: nothing real turns", style="magenta"))
     return Group(*parts)
@@ -372,10 +372,11 @@ def picture(view: LiveView) -> RenderableType:
 
 MOST_INERTIAS = 200
 _SHOWN = 6                # answers on a terminal of 24 lines
-_CELLS = 36               # of an interval's bar
+_CELLS = 36               # of an interval's bar, at most
+_BESIDE = 27              # columns beside the bar: time, J, half-width and the gaps between them
 
 
-def inertia_rows(inertias: Sequence[LiveInertia]) -> list[RenderableType]:
+def inertia_rows(inertias: Sequence[LiveInertia], width: int) -> list[RenderableType]:
     """J's interval over time, a line for each of some answers: the first, and the latest."""
     known = [one for one in inertias if one.inertia_kg_m2 is not None]
     last = inertias[-1]
@@ -384,27 +385,28 @@ def inertia_rows(inertias: Sequence[LiveInertia]) -> list[RenderableType]:
     shown = known if len(known) <= _SHOWN else [known[0], *known[1 - _SHOWN:]]
     low = min(one.low_kg_m2 for one in shown if one.low_kg_m2 is not None)
     high = max(one.high_kg_m2 for one in shown if one.high_kg_m2 is not None)
+    cells = min(_CELLS, max(len(f"{low:.4g} {high:.4g}"), width - _BESIDE))
     title = Text(f"J, kg·m², {100.0 * last.confidence:.4g} % interval (repeatability)", "dim")
     grid = Table.grid(padding=(0, 1))
-    for width in (7, _CELLS, 9, None):
-        grid.add_column(width=width, no_wrap=True)
+    for column in (7, cells, 9, None):
+        grid.add_column(width=column, no_wrap=True)
     grid.columns[0].justify = "right"
-    grid.add_row("", Text(f"{low:.4g}{f'{high:.4g}':>{_CELLS - len(f'{low:.4g}')}}", "dim"), "", "")
+    grid.add_row("", Text(f"{low:.4g}{f'{high:.4g}':>{cells - len(f'{low:.4g}')}}", "dim"), "", "")
     for one in shown:
         style = "bold" if one is shown[-1] else ""
         grid.add_row(
-            Text(minutes(one.time_s), "dim"), Text(_bar(one, low, high), style),
+            Text(minutes(one.time_s), "dim"), Text(_bar(one, low, high, cells), style),
             Text(f"{one.inertia_kg_m2:.4g}", style), Text(f"±{100.0 * one.relative_half_width:.2g} %", style),
         )
     return [title, grid, Text(GRAPHS["live"].reading, "dim"),
             Text(_said(last), "dim", no_wrap=True, overflow="ellipsis")]
 
 
-def _bar(one: LiveInertia, low: float, high: float) -> str:
-    """Return the interval between both ends of the scale, with J in it."""
+def _bar(one: LiveInertia, low: float, high: float, width: int) -> str:
+    """Return the interval between both ends of the scale, with J in it, in ``width`` cells at most."""
     def cell(value: float | None) -> int:
         share = 0.5 if value is None or high <= low else (value - low) / (high - low)
-        return min(_CELLS - 1, max(0, round(share * (_CELLS - 1))))
+        return min(width - 1, max(0, round(share * (width - 1))))
 
     begin, middle, end = cell(one.low_kg_m2), cell(one.inertia_kg_m2), cell(one.high_kg_m2)
     cells = [" "] * begin + ["─"] * (end - begin + 1)
@@ -421,10 +423,8 @@ def _said(last: LiveInertia) -> str:
     if last.inertia_kg_m2 is None:
         parts = [f"now: {last.reason}"]
     if last.tolerance is not None and last.least_left_s is not None:
-        parts.append(f"at least {minutes(last.least_left_s)} to ±{100.0 * last.tolerance:.3g} %")
-    else:
-        parts.append("to stop at an interval, use --tolerance")
-    return ", ".join(parts)
+        return ", ".join((*parts, f"at least {minutes(last.least_left_s)} to ±{100.0 * last.tolerance:.3g} %"))
+    return f"{', '.join(parts)}. --tolerance ends a run at an interval."
 
 
 def preflight_table(preflight: Preflight) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,6 +14,9 @@ import pytest
 import yaml
 
 from tdhil.cli.main import main
+from tdhil.file_kind import MAGIC
+from tdhil.recording import Stage
+from tdhil.session import RunRecord, read
 from tests.estimation.analytic import closed_form
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
@@ -63,6 +67,7 @@ def test_json_csv_parquet_and_picture_have_the_same_lines(trace, tmp_path, capsy
         rows = list(csv.DictReader(file))
     assert [float(row["magnitude_high"]) for row in rows] == [line["magnitude"]["high"] for line in lines]
     assert {row["log"] for row in rows} == {trace[0]}
+    assert {float(row["distortion_detected"]) for row in rows} == {0.0}
     for row, line in zip(rows, lines, strict=True):
         assert float(row["impedance_magnitude"]) == pytest.approx(1.0 / line["magnitude"]["value"], rel=1e-12)
         assert float(row["impedance_magnitude_low"]) == line["impedance_magnitude"]["low"]
@@ -99,6 +104,67 @@ def test_python_has_the_same_response(trace, capsys):
     assert np.abs(result.frf.response).tolist() == pytest.approx(sizes, rel=1e-14)
 
 
+@pytest.fixture
+def log(tmp_path, monkeypatch):
+    """Return ``log(**recording)``: the path of a log with a closed-form recording."""
+    def log(name="run.mcap", **more):
+        recording = replace(closed_form(rate_hz=25.0, noise=3.0), **more)
+        path = tmp_path / name
+        path.write_bytes(MAGIC)
+        records[str(path)] = RunRecord(recording, {}, str(path))
+        return str(path)
+
+    records = {}
+    monkeypatch.setattr("tdhil.cli.replay.read", lambda path, **how: records.get(str(path)) or read(path, **how))
+    return log
+
+
+@pytest.mark.parametrize("lines", [(0.1, 0.2, 0.3, 0.4), (0.1,)])
+def test_the_abort_of_a_run_is_stated(log, lines, capsys):
+    """With one line there is no J: the abort is then in the reason of the result, and frf states it too."""
+    recording = closed_form(rate_hz=25.0, noise=3.0, lines=lines, amplitudes=(1.5, 0.8, 0.25, 0.25)[:len(lines)])
+    end_s = float(recording.time_s[-1])
+    path = log(**{name: getattr(recording, name) for name in ("time_s", "speed_rad_s", "torque_nm", "excitation")},
+               stages=(Stage("acquire", 0.0, end_s, "aborted", "host: the loop stood still"),))
+    assert main(["frf", path]) == 3
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("! the run was aborted in stage acquire (host: the loop stood still)") == 1
+    assert "TDH-030" in said
+
+
+def test_a_trace_and_a_log_are_read_together(trace, log, capsys):
+    assert main(["frf", *trace, "--json"]) == 0
+    (alone,) = json.loads(capsys.readouterr().out)["responses"]
+    for files in ((trace[0], log()), (log(), trace[0])):
+        assert main(["frf", *files, *trace[1:], "--json"]) == 0
+        both = json.loads(capsys.readouterr().out)["responses"]
+        assert [one["log"] for one in both] == list(files)
+        assert alone in both
+
+
+def test_the_legend_is_printed_once(trace, log, capsys):
+    assert main(["frf", log("one.mcap"), log("two.mcap")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert (said.count("95 % intervals; model: rigid+lags"), said.count("torque scale taken as exact")) == (2, 1)
+
+
+def test_a_narrow_terminal_has_two_tables_below_each_other(trace, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    assert main(["frf", *trace]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert max(map(len, said)) <= 60
+    tables = [line.split() for line in said if line.startswith("     0.")]
+    assert [row[0] for row in tables] == ["0.1", "0.2", "0.3", "0.4"] * 2
+    assert [len(row) for row in tables] == [5] * 4 + [6] * 4
+
+
+def test_distortion_that_was_not_detected_has_no_number_in_the_table(trace, capsys):
+    assert main(["frf", *trace]) == 0
+    said = capsys.readouterr().out.splitlines()
+    at = next(line for line in said if "dist.%" in line).index("dist.%") + 5
+    assert {line[at] for line in said if line.startswith("     0.")} == {"–"}
+
+
 def test_data_without_a_response_give_the_reason_and_end_with_9(tmp_path, capsys):
     one = write_trace(tmp_path, "one", periods=2)
     assert main(["frf", *one]) == 9
@@ -115,8 +181,13 @@ def test_data_without_a_response_give_the_reason_and_end_with_9(tmp_path, capsys
     (["TRACE", "--out", "frf.xlsx"], "TDH-203", ".parquet"),
     (["TRACE", "--out", "TRACE"], "TDH-209", "the log itself"),
     (["TRACE", "--out", "nowhere/frf.csv"], "TDH-206", "folder"),
+    (["RESULT"], "TDH-208", "is a result of tdhil, not a log. Give the log: tdhil frf run.mcap"),
+    (["LOG", "--gear", "2"], "TDH-220", "run.mcap is a log of a run and contains its own"),
 ])
-def test_usage_errors_are_one_line(trace, words, code, said, capsys):
-    assert main(["frf", *(trace[0] if word == "TRACE" else word for word in words)]) == 2
+def test_usage_errors_are_one_line(trace, words, code, said, tmp_path, capsys):
+    files = {"TRACE": trace[0], "RESULT": str(tmp_path / "run1.json"), "LOG": str(tmp_path / "run.mcap")}
+    (tmp_path / "run1.json").write_text('{"verdict": "valid", "tdhil": "1.0"}')
+    (tmp_path / "run.mcap").write_bytes(MAGIC)
+    assert main(["frf", *(files.get(word, word) for word in words)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and code in error and said in error

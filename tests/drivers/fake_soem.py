@@ -30,6 +30,7 @@ class FakeSlave:
         application = self.drive.application
         self.name, self.man, self.id, self.rev = "fake", 1, 2, 3
         self.memory = bytearray(0x2000)
+        self.number(0x0004, 8, 1)
         self.number(0x0008, 0x04 if clocks else 0)
         self.number(0x0012, alias)
         self.number(0x0400, 2498)
@@ -190,21 +191,39 @@ class FakeMaster:
         self.slaves, self.manual_state_change, self.closed = [], 0, False
         self.dc_time, self.expected_wkc, self.sent = 0, 0, None
         self.counter = None            # reaction to a wrong working counter
+        self.starts, self.misread = 0, []
+        """Number of starts, and the sizes that SOEM reads in the next mappings because a frame is lost."""
+        self.on_restart = self.after_map = lambda slave: None
 
     def open(self, ifname):
         self.interface = ifname
 
     def config_init(self, usetable=False):
         self.slaves = list(self.present)
+        self.starts += 1
         for slave in self.slaves:
             slave.number(0x0130, 2)
+            slave.memory[0x0600:0x0680] = bytes(0x80)
+            slave.output = slave.input = b""
+            slave.fmmus = 0
+            if self.starts > 1:
+                self.on_restart(slave)
         return len(self.slaves)
 
     def config_map(self):
+        """Map as SOEM does: without a start before, the FMMUs of a former mapping stay active."""
+        at = 0
         for slave in self.slaves:
-            slave.output, slave.input = bytes(slave.length(0x1C12)), bytes(slave.length(0x1C13))
-            slave.number(0x0812, len(slave.output))
-            slave.number(0x081A, len(slave.input))
+            sizes = self.misread.pop(0) if self.misread else (slave.length(0x1C12), slave.length(0x1C13))
+            slave.output, slave.input = map(bytes, sizes)
+            for manager, size in ((2, sizes[0]), (3, sizes[1])):
+                slave.number(0x0802 + 8 * manager, size)
+                start = slave.number(0x0800 + 8 * manager)
+                if size:
+                    struct.pack_into("<IHBBHBBB", slave.memory, 0x0600 + 16 * slave.fmmus, at, size, 0, 7, start, 0,
+                                     4 - manager, 1)
+                    at, slave.fmmus = at + size, slave.fmmus + 1
+            self.after_map(slave)
         self.expected_wkc = 3 * len(self.slaves)
         return 64
 

@@ -136,11 +136,23 @@ def test_a_good_or_bad_graph_has_the_words_of_its_picture(graphs, name):
     assert drawn == shown, f"stale: graphs.py {name}"
 
 
-@pytest.mark.long
-def test_j_of_a_run_that_loses_a_mass_is_that_of_the_page(graphs):
+TEXTS = ["live", "angle_good", "angle_bad", "backlash"]
+
+
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.heavy if name == "backlash" else pytest.mark.long) for name in TEXTS])
+def test_a_text_of_a_simulated_fault_is_that_of_the_page(graphs, name):
     page = PAGE.read_text(encoding="utf-8")
-    drawn, shown = (NUMBER.sub("#", one) for one in (graphs.with_live(page, graphs.live_text()), page))
-    assert drawn == shown, "stale: graphs.py live"
+    drawn, shown = (NUMBER.sub("#", one) for one in (graphs.with_text(page, name, graphs.TEXTS[name]()), page))
+    assert drawn == shown, f"stale: graphs.py {name}"
+
+
+def test_torque_over_angle_and_backlash_have_an_example_of_a_simulated_fault(graphs):
+    """No graph shows them: the page has the rows of the card."""
+    page = PAGE.read_text(encoding="utf-8")
+    assert list(graphs.TEXTS) == TEXTS
+    for name in TEXTS:
+        assert f"<!-- {name} -->\n```text\n" in page, name
 
 
 def test_each_good_and_bad_graph_is_small_and_on_the_page(graphs):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from functools import cache
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 
 from tdhil.estimation import identify
 from tdhil.report.blocks import Picture, report_of
+from tdhil.report.console import PlainConsole
 from tdhil.report.document import result_document
-from tdhil.report.frequency_response import response_sentences
+from tdhil.report.frequency_response import draw_responses, print_responses, response_sentences
 from tests.estimation.analytic import closed_form
 from tests.estimation.test_frequency_response import with_torque
 from tests.report.findings import RUN
@@ -41,3 +43,30 @@ def test_a_second_set_of_phases_is_advised_for_distortion(distorted, sets, advis
     response = document["frequency_response"]
     assert (response["distortion"]["detected"], response["realisations"]) == (distorted, 1)
     assert (ADVICE in " ".join(response_sentences(response | {"realisations": sets}))) is advised
+
+
+def test_a_single_line_has_one_uncertainty_and_no_model():
+    _, document = measured(False)
+    found = document["frequency_response"]
+    one = found | {"lines": found["lines"][:1], "model": "none"}
+    assert "at the only line." in response_sentences(one)[0]
+    weak = {"magnitude": {"value": 1.0, "low": 0.5, "high": None}}
+    assert "at one of 2 lines; 1 is below the noise." in response_sentences(one | {"lines": [*one["lines"], weak]})[0]
+    console = PlainConsole(io.StringIO())
+    print_responses([{"log": "run.mcap", "simulated": False, "frequency_response": one}], console)
+    assert "95 % intervals; no model is fitted" in console.file.getvalue()
+
+
+def test_each_of_several_logs_has_its_own_colour_in_every_panel():
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
+
+    found = measured(False)[1]["frequency_response"]
+    figure = Figure()
+    draw_responses(figure, [("one", found), ("two", found), ("three", found)])
+    for axes in figure.axes[:3]:
+        curves = [line for line in axes.lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 20]
+        bands = [to_hex(one.get_facecolor()[0]) for one in axes.collections if isinstance(one, PolyCollection)]
+        assert len({to_hex(line.get_color()) for line in curves}) == len(curves) == 3, axes.get_ylabel()
+        assert len(set(bands)) == len(bands) == 3, axes.get_ylabel()

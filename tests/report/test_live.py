@@ -241,9 +241,9 @@ def answers(**more):
     ]
 
 
-def drawn(inertias):
-    console = Console(file=io.StringIO(), width=80)
-    console.print(Group(*inertia_rows(inertias)))
+def drawn(inertias, width=80):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(Group(*inertia_rows(inertias, console.width)))
     return console.file.getvalue().splitlines()
 
 
@@ -258,14 +258,24 @@ def test_the_intervals_of_j_are_drawn_to_one_scale_in_80_columns():
     assert all("●" in bar and "±" in bar for bar in bars)
     assert bars[-1].split()[-3:] == ["104", "±0.34", "%"]
     assert "12 periods, p 0.41" in said
-    assert "--tolerance" in said
+    assert said.endswith("p 0.41. --tolerance ends a run at an interval.")
     assert max(map(len, drawn(answers(tolerance=0.01, least_left_s=39.0)))) <= 80
     assert "at least 39 s to ±1 %" in drawn(answers(tolerance=0.01, least_left_s=39.0))[-1]
 
 
+@pytest.mark.parametrize("width", [40, 50, 60, 72, 80])
+def test_no_figure_is_cut_in_a_narrow_terminal(width):
+    lines = drawn(answers(), width)
+    assert max(map(len, lines)) <= width
+    bars = [line for line in lines if "●" in line]
+    assert [bar.split()[-3:] for bar in bars] == [
+        ["104", f"±{half}", "%"] for half in ("3.4", "0.56", "0.48", "0.42", "0.37", "0.34")]
+    assert lines[1].split() == ["100", "107"]
+
+
 def test_one_period_is_written_in_the_singular():
     first = LiveInertia(60.0, 1, 0.95, "valid", "", 104.0, 100.0, 108.0, 100.0, 108.0)
-    assert "1 period, " in drawn([first])[-1]
+    assert drawn([first])[-1].startswith("1 period. ")
 
 
 def test_without_a_number_the_reason_is_shown():

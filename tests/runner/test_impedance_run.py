@@ -10,8 +10,10 @@ from drivers.errors import CommunicationLost, LimitHit, PreflightRefused
 from sim_bus.params import DriveParams, RigParams
 from tdhil.errors import Interrupted
 from tdhil.estimation import Verdict, identify
+from tdhil.runner.excitation import MotionLimits, PlanRequest, RigGuess
 from tdhil.runner.preconditions import choose_mode, refuse_slow_reference
 from tdhil.runner.settings import ExcitationRequest
+from tdhil.runner.stages import impedance
 from tests.runner.line_drive import LIMITS, Line, LineDrive, run_line
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
@@ -66,6 +68,23 @@ def test_the_motion_is_as_planned(measured):
     assert plan.speed_min_rad_s - 0.2 < speed.min() and speed.max() < plan.speed_max_rad_s + 0.2
     assert plan.speed_max_rad_s - plan.speed_min_rad_s < 2.5 * np.ptp(speed)
     assert np.max(np.abs(measured.recording.torque_nm)) < LIMITS.torque_nm
+
+
+@pytest.mark.parametrize("seed", [10, 189, 331])
+def test_the_planned_offset_stays_within_its_limit_between_the_points_of_the_grid(seed, monkeypatch):
+    """The peak was looked for at 1024 points of the period. The guard refused a higher one in mid-run, with exit 1."""
+    rng = np.random.default_rng(seed)
+    monkeypatch.setattr(impedance, "DRAWS", 1)
+    monkeypatch.setattr(impedance, "PHASES_RAD", tuple(rng.uniform(0.0, 2.0 * np.pi, len(impedance.HARMONICS))))
+    lines = len(impedance.HARMONICS)
+    plan = impedance._planned(
+        (np.full(lines, 1e-6 + 0j), np.full(lines, 21.0 + 0j)), 20.0, 4.0,
+        MotionLimits(1.0, 7.0, 4000.0, 20.0), RigGuess(104.0, 8.0, 60.0), 0.4, PlanRequest(), 0.0, 160.0, 30)
+    time_s = np.arange(0.0, impedance.PERIOD_S, 5e-4)
+    offset_nm = sum(
+        size * np.cos(2.0 * np.pi * harmonic / impedance.PERIOD_S * time_s + phase)
+        for harmonic, size, phase in zip(impedance.HARMONICS, plan.torque_amplitudes_nm, plan.phases_rad, strict=True))
+    assert 159.0 < np.max(np.abs(offset_nm)) <= 160.0
 
 
 @pytest.mark.heavy

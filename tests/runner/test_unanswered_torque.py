@@ -9,6 +9,7 @@ import pytest
 
 from drivers import Command, Mode
 from tdhil.runner.observer.unanswered_torque import (
+    BEYOND_S,
     FLAT_LIMIT_S,
     HELD_S,
     STRAINED_S,
@@ -115,7 +116,8 @@ def test_in_speed_mode_a_speed_that_is_constant_with_the_torque_at_its_limit_is_
 
 def constant(kind, until_s, *, speed_rad_s, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, **said):
     """Return the time at which a rule of this kind finds reports that stay the same from the first point on, s."""
-    return first(kind(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
+    lag_s = () if kind is HeldShaft else (LAG_S,)
+    return first(kind(STRING, STILL_RAD_S, *lag_s), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
                  lambda _: Command(mode, setpoint_rad_s, torque_nm), **said)
 
 
@@ -160,8 +162,8 @@ def test_a_torque_at_its_limit_is_no_contradiction_without_each_of_these(other):
 
 
 def test_the_time_at_the_limit_restarts():
-    assert first(TorqueAtLimit(STRING, STILL_RAD_S), lambda time_s: LIMIT_NM * (time_s % 3.0 < 2.85), lambda _: 4.0,
-                 12.0, lambda _: Command(Mode.SPEED, 4.0, 0.0), known=False) is None
+    assert first(TorqueAtLimit(STRING, STILL_RAD_S, LAG_S), lambda time_s: LIMIT_NM * (time_s % 3.0 < 2.85),
+                 lambda _: 4.0, 12.0, lambda _: Command(Mode.SPEED, 4.0, 0.0), known=False) is None
 
 
 def ignored(until_s=8.0, speed_of=lambda _: 0.0, mode_of=lambda _: Mode.SPEED, stopping=True, torque_nm=HOLDING_NM,
@@ -191,7 +193,34 @@ def test_only_the_last_seconds_of_a_yield_count():
         6.0 + YIELD_S, abs=0.3)
 
 
-def test_the_rules_of_an_unknown_load_are_for_a_string_only():
-    assert [type(rule) for rule in rules(LIMITS, STILL_RAD_S, LAG_S, EVERY_S)] == [HeldShaft]
+def at_limit_without_string(rule, speed_rad_s, torque_nm, **other):
+    """Return the time at which a constant torque and speed are found while 3 rad/s are commanded, s."""
+    return first(rule(LIMITS, STILL_RAD_S, LAG_S), lambda _: torque_nm, lambda _: speed_rad_s, 6.0,
+                 lambda _: Command(Mode.SPEED, 3.0, 0.0), **{"known": False, **other})
+
+
+def test_without_a_string_torque_at_its_limit_drives_no_shaft_beyond_its_setpoint():
+    assert at_limit_without_string(TorqueAtLimit, 4.0, LIMITS.torque_nm) == pytest.approx(BEYOND_S, abs=0.11)
+
+
+@pytest.mark.parametrize(("speed_rad_s", "torque_nm", "other"), [
+    (4.0, -LIMITS.torque_nm, {}), (2.0, LIMITS.torque_nm, {}), (3.1, LIMITS.torque_nm, {}),
+    (4.0, 0.5 * LIMITS.torque_nm, {}), (4.0, LIMITS.torque_nm, {"known": True}),
+    (4.0, LIMITS.torque_nm, {"moved": False}),
+], ids=["braking", "below", "near", "half the torque", "J known", "never moved"])
+def test_it_is_not_found_without_each_of_these(speed_rad_s, torque_nm, other):
+    assert at_limit_without_string(TorqueAtLimit, speed_rad_s, torque_nm, **other) is None
+
+
+def test_without_a_string_a_slow_flat_speed_counts_until_j_is_known_and_not_in_a_stop():
+    """A faster one may be at the speed at which a viscous load is as large as the torque limit."""
+    assert at_limit_without_string(FlatSpeed, 0.5, LIMITS.torque_nm) == pytest.approx(FLAT_LIMIT_S, abs=0.11)
+    assert at_limit_without_string(FlatSpeed, 4.0, LIMITS.torque_nm) is None
+    for other in ({"known": True}, {"stopping": True}, {"moved": False}):
+        assert at_limit_without_string(FlatSpeed, 0.5, LIMITS.torque_nm, **other) is None
+
+
+def test_the_yield_is_for_a_string_only():
+    assert {type(rule) for rule in rules(LIMITS, STILL_RAD_S, LAG_S, EVERY_S)} == {HeldShaft, TorqueAtLimit, FlatSpeed}
     assert {type(rule) for rule in rules(STRING, STILL_RAD_S, LAG_S, EVERY_S)} == {
         HeldShaft, TorqueAtLimit, FlatSpeed, IgnoredYield}

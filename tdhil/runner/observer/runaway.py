@@ -71,7 +71,7 @@ class Runaway:
         self._before_repeats_rad_s: float | None = None
         self._repeated_s = 0.0
         self._pushing_s = self._pushed_nm = 0.0
-        self._apart_nm_s = self._took_s = 0.0
+        self._apart_nm_s = self._took_s = self._impulse_nms = 0.0
         self._for_s = self._unanswered_s = self._unanswered_rad_s = 0.0
         self._speed_above_s = self._angle_above_s = 0.0
         self._seen_s: float | None = None
@@ -117,6 +117,7 @@ class Runaway:
             self._before_repeats_rad_s = self._by_impulse_rad_s
             return
         self._for_s += point.time_s - before.time_s
+        self._impulse_nms += point.impulse - before.impulse
         if self._for_s >= PUSHING_S:
             self._slowest_rad_s = min(self._slowest_rad_s, abs(point.speed))
         self._inertia_known = known.known
@@ -233,6 +234,10 @@ class Runaway:
         pushes = not self._limits.has_drill_string or (reports_trusted and self._for_s >= ramp_s)
         if self._pushing_s >= PUSHING_S and pushes:
             return f"{in_nm(self._pushed_nm)} push the shaft on"
+        # rig.yaml states a rate that the torque limit can give: this impulse stops the shaft from its speed limit
+        spent = abs(self._impulse_nms) > (1.0 + FASTER_SHARE) * ramp_s * self._limits.torque_nm
+        if spent and not (reports_trusted or self._inertia_known or self._limits.has_drill_string):
+            return f"{self._impulse_nms:.0f} N·m·s since the quick stop reverse a shaft from its speed limit"
         by_impulse = self._by_impulse_rad_s
         if by_impulse is not None and self._beyond(by_impulse, more_rad_s, reports_trusted):
             return f"the torque since the quick stop accounts for {by_impulse:.2f} rad/s"

@@ -15,11 +15,10 @@ from drivers import Command, Mode
 from profiles.quantities import in_nm
 from tdhil.runner.observer.contradiction import Contradiction, Signal
 from tdhil.runner.observer.points import Point
-from tdhil.runner.observer.shaft_bounds import ShaftBounds
+from tdhil.runner.observer.shaft_bounds import BREAKAWAY, SLOW_SHARE, ShaftBounds
 from tdhil.runner.settings import MachineLimits
 
-AT_LIMIT_SHARE = 0.9
-"""Share of the torque limit from which the torque is at its limit."""
+AT_LIMIT_SHARE = 0.9      # of the torque limit, from which the torque is at its limit
 
 HELD_S = 1.5
 """Time, s, after which a shaft that moved before is blocked or not measured: it is reported at standstill in spite
@@ -32,14 +31,20 @@ limit of the commanded one. A speed loop at its setpoint does not need such a to
 FLAT_S, FLAT_LIMIT_S, FLAT_LAGS = 1.0, 1.5, 3.0
 """A reported speed that stays within its own noise is lost in two cases. First case: in torque mode the commanded
 torque should have moved it for FLAT_S, beyond FLAT_LAGS lags. Second case: the torque stays at its limit for
-FLAT_LIMIT_S. The speed is then not controlled, and would be constant only under a load exactly equal to the limit."""
+FLAT_LIMIT_S. The speed is then not controlled, and would be constant only under a load exactly equal to the limit.
+Without a string it counts at low speed, if less torque moved the shaft, until the momentum balance knows J."""
+
+FLAT_SHARE, LOADED_SHARE = 0.02, 0.75
+"""Share of the speed limit: a coarser report needs longer, as the shaft may be heavy. Share of the torque limit: if
+friction at low speed may exceed it, the load may be as large as the limit."""
 
 FLAT_MOVES = 12.0
 """Least expected change of the speed, as a multiple of its noise, by the bounds of J and of the string's impedance.
 An oscillating string keeps a healthy speed within its noise up to 5.6 times that (`benchmarks/healthy_runs.py`)."""
 
-YIELD_S, SMOOTH_S = 4.0, 0.4
-"""Time for which the stop commands a yield, and length of the compared means, s."""
+BEYOND_S, BEYOND_LAGS = 1.0, 2.0   # s, lags: longest time for which torque drives a shaft beyond its setpoint
+
+YIELD_S, SMOOTH_S = 4.0, 0.4       # s; time for which the stop commands a yield, and length of the compared means
 
 YIELD_MOVES, YIELD_STILL = 3.0, 1.0
 """Least commanded speed, as a multiple of the noise of the reported speed and of the standstill speed."""
@@ -81,13 +86,9 @@ class UnansweredTorque(Protocol):
 
 def rules(limits: MachineLimits, still_rad_s: float, lag_s: float, point_s: float) -> tuple[UnansweredTorque, ...]:
     """Return the rules for a shaft with these limits; ``still_rad_s``: speed that counts as standstill, rad/s."""
-    always: tuple[UnansweredTorque, ...] = (HeldShaft(limits, still_rad_s),)
-    if not limits.has_drill_string:
-        return always
-    return (
-        TorqueAtLimit(limits, still_rad_s), FlatSpeed(limits, still_rad_s, lag_s),
-        IgnoredYield(still_rad_s, lag_s, point_s), *always,
-    )
+    always = (TorqueAtLimit(limits, still_rad_s, lag_s), FlatSpeed(limits, still_rad_s, lag_s),
+              HeldShaft(limits, still_rad_s))
+    return (*always, IgnoredYield(still_rad_s, lag_s, point_s)) if limits.has_drill_string else always
 
 
 def _strained(point: Point, limits: MachineLimits) -> bool:
@@ -119,27 +120,33 @@ class HeldShaft:
 
 
 class TorqueAtLimit:
-    """Rule: torque at its limit although the reported speed is the commanded one; for the time before J is known."""
+    """Rule: speed control needs no torque at its limit there; for the time before J is known.
 
-    def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
+    Above a string the reported speed is the commanded one. Without one, it is beyond, and the torque drives it on.
+    """
+
+    def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
         self._limits = limits
         self._still_rad_s = still_rad_s
+        self._longest_s = STRAINED_S if limits.has_drill_string else max(BEYOND_S, BEYOND_LAGS * lag_s)
         self._strained_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
         """Evaluate one point."""
-        point, command = now.point, now.command
-        apart = abs(point.speed - command.speed_rad_s)
-        near = command.mode is Mode.SPEED and apart <= STRAINED_SHARE * self._limits.speed_max_rad_s
-        turns = abs(point.speed) > STANDSTILLS * self._still_rad_s
-        strained = _strained(point, self._limits) and near and turns and not now.bounds.known    # else (1) detects it
-        self._strained_s = self._strained_s + now.block_s if strained else 0.0
-        if self._strained_s < STRAINED_S:
+        point, command, least = now.point, now.command, STANDSTILLS * self._still_rad_s
+        apart, near = point.speed - command.speed_rad_s, self._limits.has_drill_string
+        found = now.moved and point.speed * point.torque > 0.0 and math.copysign(1.0, point.torque) * apart > least
+        if near:
+            found = abs(apart) <= STRAINED_SHARE * self._limits.speed_max_rad_s and abs(point.speed) > least
+        found = found and command.mode is Mode.SPEED and _strained(point, self._limits) and not now.bounds.known
+        self._strained_s = self._strained_s + now.block_s if found else 0.0     # if J is known, (1) detects it
+        if self._strained_s < self._longest_s:
             return None
         return Contradiction(
             frozenset({Signal.SPEED, Signal.TORQUE}),
-            f"the torque has been at its limit for {STRAINED_S:g} s ({in_nm(point.torque)}) while the reported speed"
-            f" stays at {point.speed:.2f} rad/s, near the commanded {command.speed_rad_s:.2f} rad/s",
+            f"the torque has been at its limit for {self._longest_s:g} s ({in_nm(point.torque)}) while the reported"
+            f" speed stays at {point.speed:.2f} rad/s, {'near' if near else 'beyond'} the commanded"
+            f" {command.speed_rad_s:.2f} rad/s",
             "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
         )
 
@@ -164,7 +171,8 @@ class FlatSpeed:
         """Evaluate one point."""
         point = now.point
         for_s = self._unanswered_s(now)
-        if for_s <= 0.0 or abs(point.speed) <= STANDSTILLS * self._still_rad_s:
+        least = (STANDSTILLS if self._limits.has_drill_string else 1.0) * self._still_rad_s     # below: `HeldShaft`
+        if for_s <= 0.0 or abs(point.speed) <= least:
             return None
         return Contradiction(
             frozenset({Signal.SPEED}),
@@ -191,12 +199,12 @@ class FlatSpeed:
         for_s = point.time_s - self._since_s
         if command.mode is Mode.SPEED:
             self._count_from(point.time_s, torque)
-            return for_s if self._strained_s >= FLAT_LIMIT_S else 0.0
+            return for_s if self._strained_s >= self._limit_s(now, noise_rad_s) else 0.0
         self._impulse_nms += took_s * torque
         counted_s = point.time_s - self._from_s
         if counted_s <= self._lag_s:
             self._load_low, self._load_high = min(self._load_low, torque), max(self._load_high, torque)
-        if not now.bounds.known or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
+        if not (self._limits.has_drill_string and now.bounds.known) or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
             return 0.0
         moves = FLAT_MOVES * noise_rad_s
         unbalanced_nms = max(
@@ -204,6 +212,16 @@ class FlatSpeed:
         by_inertia = unbalanced_nms / now.bounds.inertia_high
         by_string = (self._most - self._least) / now.bounds.string_nm_s_rad
         return for_s if min(by_inertia, by_string) >= moves else 0.0
+
+    def _limit_s(self, now: PointInRun, noise_rad_s: float) -> float:
+        """Return the time for which a torque at its limit may leave the speed within this noise, s."""
+        if self._limits.has_drill_string:
+            return FLAT_LIMIT_S
+        limits, moved_nm = self._limits, BREAKAWAY * now.bounds.breakaway_nm
+        slow = abs(now.point.speed) <= SLOW_SHARE * limits.speed_max_rad_s and not (now.stopping or now.bounds.known)
+        if not (slow and now.moved and moved_nm <= LOADED_SHARE * limits.torque_nm):
+            return math.inf            # in a stop `Runaway` has a slower rule
+        return FLAT_LIMIT_S * max(1.0, noise_rad_s / (FLAT_SHARE * self._limits.speed_max_rad_s))
 
     def _count_from(self, time_s: float, torque_nm: float) -> None:
         """Begin the range and the impulse of the torque anew."""

@@ -170,7 +170,11 @@ class _ExcitationWave:
         return self.mean_rad_s + DITHER_COUNTS * self._resolution_rad_s * math.sin(turn)
 
 
-_GRID = np.exp(2j * np.pi * np.outer(np.arange(1024), HARMONICS) / 1024)
+_POINTS = 1024               # of a period, at which a peak is sought
+_GRID = np.exp(2j * np.pi * np.outer(np.arange(_POINTS), HARMONICS) / _POINTS)
+BETWEEN = math.cos(math.pi * max(HARMONICS) / _POINTS)
+"""Least share of its peak that a sum of these harmonics reaches on the grid, whose points are within π/`_POINTS` of any
+instant. Next to its peak M, a trigonometric polynomial of degree n stays above M cos(n t) for |n t| < π (M. Riesz)."""
 
 
 def _peak(lines: NDArray[Any], phases_rad: Sequence[float]) -> float:
@@ -255,7 +259,7 @@ def _planned(
     limits = [
         (ROOM_SHARE * speed_room, shares * speed),
         (ROOM_SHARE * (room.usable_torque_nm - abs(steady)), shares * torque),
-        (0.999 * largest_nm, shares.astype(np.complex128)),
+        (BETWEEN * largest_nm, shares.astype(np.complex128)),
     ]
     rng = np.random.default_rng(0)
     scale, phases_rad = 0.0, PHASES_RAD

@@ -470,9 +470,9 @@
         const failed = checks.filter((one) => one.grade === "bad").length;
         show(where,
           el("p", { class: failed ? "alarm" : "verdict good", role: "status" }, failed ? tr("Failed: {count} of {all} checks. Correct them before the first motion.", { count: failed, all: checks.length }) : tr("No check failed. Nothing has moved.")),
-          el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": tr("Findings of the check") }, el("table", {},
+          scrolls(el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": tr("Findings of the check") }, el("table", {},
             el("thead", {}, el("tr", {}, ...[tr("result"), tr("check"), tr("found"), tr("what to do")].map((text) => el("th", { scope: "col" }, text)))),
-            el("tbody", {}, ...checks.map((one) => el("tr", { class: results[one.grade][0] }, el("td", {}, results[one.grade][1]), el("th", { scope: "row" }, english(one.name)), el("td", {}, english(one.said)), el("td", {}, english(one.do))))))));
+            el("tbody", {}, ...checks.map((one) => el("tr", { class: results[one.grade][0] }, el("td", {}, results[one.grade][1]), el("th", { scope: "row" }, english(one.name)), el("td", {}, english(one.said)), el("td", {}, english(one.do)))))))));
       } catch (error) {
         over();
         show(where, el("p", { class: "alarm", role: "alert" }, whyOf(error)));
@@ -542,7 +542,40 @@
     });
   }
 
+  const sideways = new ResizeObserver((found) => {
+    for (const { target } of found) target.classList.toggle("wider", target.scrollWidth > target.clientWidth + 1);
+  });
+  /** Mark a part of the page while it is wider than the screen: CSS then shows that it scrolls. */
+  function scrolls(part) {
+    part.dataset.hint = tr("Wider than the screen: scroll sideways →");
+    sideways.observe(part);
+    return part;
+  }
+
   // -- live
+
+  /** Receive the live messages of a run. A connection that ends is made again while ``goesOn`` is true. */
+  function listen(run, take, goesOn = () => true) {
+    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${API}/live/${run}`);
+    socket.addEventListener("message", (event) => { if (goesOn()) take(JSON.parse(event.data)); else socket.close(); });
+    socket.addEventListener("close", (event) => {
+      if (event.code === 4401) loggedOut();
+      else if (goesOn()) setTimeout(() => listen(run, take, goesOn), 700);
+    });
+  }
+  /** Show J from the periods so far: the latest interval, and what belongs to it. Return whether J is known. */
+  function inertiaNow(inertias) {
+    const last = inertias[inertias.length - 1], known = inertias.filter((one) => one.inertia_kg_m2 !== null).pop();
+    byId("inertia-now").textContent = known ? withUnit(interval(known.inertia_kg_m2, known.low_kg_m2, known.high_kg_m2)) : "–";
+    const words = [last.periods === 1 ? tr("1 period") : tr("{count} periods", { count: last.periods })];
+    if (known) words.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
+    if (last.p_value !== null) words.push(`p = ${number(last.p_value, 2)}`);
+    if (last.tolerance !== null && last.least_left_s !== null) words.push(tr("at least {time} to ±{share} %", { time: span(last.least_left_s), share: local(String(Number((100 * last.tolerance).toPrecision(3)))) }));
+    if (last.inertia_kg_m2 === null) words.push(byLabels(last.reason));
+    byId("inertia-said").textContent = words.join(", ");
+    byId("inertia-row").hidden = false;
+    return Boolean(known);
+  }
 
   /** When a stop was asked for, when the drive reacted, and when it stood still. */
   function stopSteps(stop, asking = false) {
@@ -631,17 +664,9 @@
 
     let inertias = [], drawInertia = null;
     /** Show J from the periods so far: the latest as figures, all of them as a graph. */
-    function inertiaNow() {
-      const last = inertias[inertias.length - 1], known = inertias.filter((one) => one.inertia_kg_m2 !== null).pop();
+    function drawn() {
+      const known = inertiaNow(inertias);
       byId("inertia").hidden = !known;
-      byId("inertia-now").textContent = known ? withUnit(interval(known.inertia_kg_m2, known.low_kg_m2, known.high_kg_m2)) : "–";
-      const words = [last.periods === 1 ? tr("1 period") : tr("{count} periods", { count: last.periods })];
-      if (known) words.push(percent((known.high_kg_m2 - known.low_kg_m2) / 2 / known.inertia_kg_m2));
-      if (last.p_value !== null) words.push(`p = ${number(last.p_value, 2)}`);
-      if (last.tolerance !== null && last.least_left_s !== null) words.push(tr("at least {time} to ±{share} %", { time: span(last.least_left_s), share: local(String(Number((100 * last.tolerance).toPrecision(3)))) }));
-      if (last.inertia_kg_m2 === null) words.push(byLabels(last.reason));
-      byId("inertia-said").textContent = words.join(", ");
-      byId("inertia-row").hidden = false;
       if (!known) return;
       drawInertia ||= inertiaPlot(byId("plot-inertia"));
       drawInertia(inertias);
@@ -657,7 +682,7 @@
       for (const one of found.events || []) event(one);
       for (const one of found.stages || []) done[one.name] = one;
       if (found.type === "hello") inertias = [];
-      if (found.inertias && found.inertias.length) { inertias.push(...found.inertias); inertiaNow(); }
+      if (found.inertias && found.inertias.length) { inertias.push(...found.inertias); drawn(); }
       if (found.limits) charts.limit(found.limits);
       if (found.status) { status = found.status; state(); }
       if (found.stages || found.status) stages();
@@ -873,15 +898,7 @@
       field.value = "";
     });
 
-    function connect() {
-      const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${API}/live/${run}`);
-      socket.addEventListener("message", (event) => take(JSON.parse(event.data)));
-      socket.addEventListener("close", (event) => {
-        if (event.code === 4401) loggedOut();
-        else setTimeout(connect, 700);
-      });
-    }
-    connect();
+    listen(run, take);
 
     setInterval(() => {
       const now = Date.now(), silent = message === 0 || now - message > SILENT_MS;
@@ -992,9 +1009,10 @@
   });
 
   const pages = { error: errorPage, login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, interval, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, rounded, shareOf, show, span, speedUnit, stateText, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
+  window.tdhil = { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, csrf, el, eventText, every, fillsFirst, follow, inertia, inertiaNow, interval, listen, markWrong, marked, may, inSpeedUnit, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, refused, rehearsal, rounded, scrolls, shareOf, show, span, speedUnit, stateText, stopSteps, submits, unmark, unwatched, uploaded, waiting, when, whyOf, zone };
   document.addEventListener("DOMContentLoaded", () => {
     speedUnits();
+    document.querySelectorAll(".scroll").forEach(scrolls);
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {
       (pages[document.body.dataset.page] || (() => {}))();

@@ -2,13 +2,13 @@
 "use strict";
 (() => {
   const { byLabels, coded, english, errorText, fixed, local, point, precise, tr, word, worded } = window.tdhilLanguage;
-  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, interval, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, rounded, shareOf, show, span, speedUnit, stateText, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
+  const { API, ENDED, LEAVES, STATES, Refused, asked, away, axis, badge, byId, call, closes, colour, el, eventText, every, follow, inSpeedUnit, inertia, inertiaNow, interval, listen, markWrong, may, nearest, number, ofResult, ofSpeed, onSpeedUnit, pacing, pages, percent, reading, rehearsal, rounded, scrolls, shareOf, show, span, speedUnit, stateText, stopSteps, submits, toolbar, unmark, unwatched, uploaded, viewOf, waiting, when, whyOf, zone } = window.tdhil;
 
   // -- one run
 
   function resultOf(run) {
     const result = run.result;
-    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, stateText(run.state, run.stop, run.history)))];
+    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, `${stateText(run.state, run.stop, run.history)}${run.stage && !ENDED.includes(run.state) ? `: ${word(run.stage, "stage")}` : ""}`))];
     if (run.error) parts.push(el("p", { class: wanted(run) ? "dim" : "alarm" }, errorText(run.error)));
     if (run.watch && run.watch.lost) parts.push(el("p", { class: "alarm" }, unwatched(run.watch)));
     const steps = stopSteps(run.stop);
@@ -125,7 +125,7 @@
       curve.map((one) => [ofSpeed(() => `${number(inSpeedUnit(one.speed_rad_s))} ${speedUnit()}`), of(one.torque_nm)])));
   }
   const of = (one) => interval(one.value, one.low, one.high) ?? "–";
-  const region = (label, table) => el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, table);
+  const region = (label, table) => scrolls(el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, table));
   /** Make a collapsed table. Cells are texts or elements. */
   const numbers = (label, heads, rows) => el("details", {}, el("summary", {}, label), region(label, el("table", {},
     el("thead", {}, el("tr", {}, ...heads.map((one) => el("th", { scope: "col" }, one)))),
@@ -134,9 +134,12 @@
   function runPage() {
     const id = document.body.dataset.run;
     const kept = (run) => run.state + run.files.filter((one) => !["report.pdf", "samples.csv"].includes(one)).join();    // content on which the page depends
-    let shown = "", files = null, outdated = (document.body.dataset.outdated || "").split(" ");
+    let shown = "", files = null, going = false, inertias = [], outdated = (document.body.dataset.outdated || "").split(" ");
     every(1500, async () => {
-      const run = await call("GET", `/runs/${id}`);
+      const run = await call("GET", `/runs/${id}`), goes = !ENDED.includes(run.state);
+      if (goes && !going) listen(id, soFar, () => going);
+      going = goes;
+      if (!goes) byId("so-far").hidden = true;
       outdated = run.outdated;
       if (files !== null && files !== kept(run)) again();
       if (files === null && run.files.includes("report.html")) await pictures(id, run.result);
@@ -156,6 +159,14 @@
         el("td", {}, ofResult(one.result) || "–"),
         el("td", {}, one.result && one.result.inertia_kg_m2 ? shareOf(one.result.inertia_kg_m2.value, one.result.inertia_kg_m2.low_total, one.result.inertia_kg_m2.high_total) : ""))));
     });
+    /** Show the time of the run and its latest J, while it goes on. */
+    function soFar(found) {
+      if (found.type === "hello") inertias = [];
+      inertias.push(...(found.inertias || []));
+      byId("time-now").textContent = found.time_s === null ? "–" : span(found.time_s);
+      byId("so-far").hidden = found.time_s === null;
+      if (inertias.length) inertiaNow(inertias);
+    }
     let typed = false;
     byId("main").addEventListener("input", () => { typed = true; });
     /** Show the new content of this page: at once, or on request if the page has a text that is not saved. */

@@ -76,6 +76,19 @@ def test_the_last_value_is_the_one_of_the_result(page, served):
     assert page.evaluate("J => window.tdhil.ofResult({ inertia_kg_m2: J })", document) == now.inner_text()
 
 
+def test_the_page_of_a_run_shows_stage_time_and_j_until_the_run_ends(page, served):
+    run = played(served, FIRST, LAST)
+    page.goto(f"/runs/{run}")
+    page.locator("#inertia-now", has_text=SHOWN).wait_for()
+    assert page.locator("#result").inner_text().startswith("moving: setup")
+    assert page.locator("#time-now").inner_text() == "2 s"
+    assert "p = 0.41" in page.locator("#inertia-said").inner_text()
+    page.get_by_label("Operator").fill("Anna")         # the page is not loaded again
+    served.service.supervisor.stop(run, "local")
+    page.get_by_text("This page has new content.").wait_for()
+    assert not page.locator("#so-far").is_visible()
+
+
 def test_one_period_is_written_in_the_singular(page, served):
     run = played(served, LiveInertia(0.5, 1, 0.95, "not_identifiable", "the scatter stays open"))
     page.goto(f"/runs/{run}/live")

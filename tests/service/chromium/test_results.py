@@ -195,6 +195,26 @@ def test_on_a_phone_the_list_of_runs_shows_j_and_verdict(page, served):
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390, text
 
 
+@pytest.mark.parametrize(("width", "hinted"), [(390, True), (1280, False)])
+def test_a_graph_that_is_wider_than_the_screen_shows_that_it_scrolls(page, served, width, hinted):
+    run = ended_run(served)
+    svg = "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 500 100'><path d='M0 0L500 100' stroke='red'/></svg>"
+    (served.service.store.place(run) / "report.html").write_text("".join(
+        f"<h2>{name}</h2><figure>{svg}<figcaption>about</figcaption></figure>"
+        for name in ("Speed and torque", "Estimates of the inertia")))
+    page.set_viewport_size({"width": width, "height": 800})
+    page.goto(f"/runs/{run}")
+    graph = page.get_by_role("region", name="Estimates of the inertia, picture")
+    graph.scroll_into_view_if_needed()
+    wait_for("the picture", lambda: graph.locator("img").evaluate("one => one.complete && one.naturalWidth > 0"))
+    shown = "one => getComputedStyle(one, '::before').content"
+    wait_for("the hint", lambda: ("scroll sideways" in graph.evaluate(shown)) is hinted)
+    assert graph.evaluate("one => one.scrollWidth > one.clientWidth") is hinted
+    graph.focus()
+    page.keyboard.press("ArrowRight")
+    wait_for("the right part", lambda: (graph.evaluate("one => one.scrollLeft") > 0) is hinted)
+
+
 def test_the_list_of_runs_names_a_rig_as_its_other_pages_do(page, served):
     run = ended_run(served, "hostile", {"note": "done"})
     page.goto("/runs")
