@@ -53,7 +53,8 @@ class PeriodicCase(Case):
     """Case with periodic excitation: its whole periods, their spectral lines, and B from the mean operating points.
 
     ``every``: the lines pooled over the segments. ``lines``: those where both signals are clear of the scatter;
-    ``usable``: those where at least one signal is.
+    ``usable``: those where at least one signal is. ``undeclared``: warnings of undeclared motion in
+    the reported samples.
     """
 
     levels: Levels
@@ -61,6 +62,7 @@ class PeriodicCase(Case):
     fits: tuple[PeriodLines, ...]
     constraint: ViscousConstraint | None
     every: tuple[SpectralLine, ...]
+    undeclared: tuple[str, ...] = ()
     lines: tuple[SpectralLine, ...] = ()
     usable: tuple[SpectralLine, ...] = ()
 

@@ -48,7 +48,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             case = periodic = measured(case, excitation)
             case = periodic = clear_lines(periodic)
             finding = identify_lines(periodic)
-            case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation))
+            case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation, periodic))
             finding = with_backlash(case, finding)
     except Refused as refused:
         finding = Finding(refusal=refused.refusal)
@@ -75,9 +75,11 @@ def _impedance(case: Case, finding: Finding, found: Identification) -> DriveImpe
     return refusal(asked, finding.refusal.reason, finding.refusal.advice)
 
 
-def _again(case: Case, excitation: Excitation, samples: Samples) -> tuple[PeriodicCase, Finding]:
+def _again(
+    case: Case, excitation: Excitation, reported: PeriodicCase, samples: Samples
+) -> tuple[PeriodicCase, Finding]:
     """Return the periodic case with other samples, and its finding. Raises Refused as the first time."""
-    found = clear_lines(measured(replace(case, samples=samples), excitation))
+    found = clear_lines(measured(replace(case, samples=samples), excitation, reported))
     return found, identify_lines(found)
 
 

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from profiles import MessageCode
 from tdhil.estimation import angle_harmonics, identify
 from tdhil.estimation.angle_harmonics import HarmonicTorque
 from tests.estimation.angle_bench import RATED_NM, OverAngle, run_over_angle
@@ -66,6 +67,15 @@ def test_another_model_may_be_selected_without_the_harmonic():
     found = identify(recording)
     assert [one.order for one in found.harmonics] == [6]
     assert found.inertia.low <= TRUE <= found.inertia.high
+
+
+@pytest.mark.heavy
+def test_the_subtracted_torque_is_no_undeclared_motion():
+    """The drive reports no torque of 0.68 Hz in this run. Only the torque without the harmonic has it."""
+    for recording in recorded(1, 0.1):
+        found = identify(recording)
+        assert [one.order for one in found.harmonics] == [1]
+        assert not any(one.entry is MessageCode.UNDECLARED_MOTION for one in found.warnings)
 
 
 @pytest.mark.heavy
