@@ -28,8 +28,9 @@ from tdhil.estimation.periodic import clear_lines, identify_lines, measured
 from tdhil.estimation.result import DriveImpedance, Identification, Options, Refused
 from tdhil.estimation.samples import Samples, excited_window, usable_samples
 from tdhil.estimation.setpoint_sampling import stretched
+from tdhil.estimation.stated_lags import with_lags_checked
 from tdhil.estimation.time_domain import identify_record, recorded
-from tdhil.recording import Excitation, Recording, aborted_stage, before_abort
+from tdhil.recording import Excitation, LagPrior, Recording, aborted_stage, before_abort
 
 
 def identify(recording: Recording, options: Options | None = None) -> Identification:
@@ -42,6 +43,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         if excitation is None or not excitation.segments:
             case = recorded(case)
             finding = identify_record(case)
+            finding = with_lags_checked(case, finding, partial(_recorded_again, case))
         else:
             # the case is built step by step, so that a refusal contains the counts so far
             bare = case
@@ -50,6 +52,7 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             finding = identify_lines(periodic)
             case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation, periodic))
             finding = with_backlash(case, finding)
+            finding = with_lags_checked(case, finding, partial(_without_lags, case, bare, excitation))
     except Refused as refused:
         finding = Finding(refusal=refused.refusal)
     seen = finding
@@ -81,6 +84,17 @@ def _again(
     """Return the periodic case with other samples, and its finding. Raises Refused as the first time."""
     found = clear_lines(measured(replace(case, samples=samples), excitation, reported))
     return found, identify_lines(found)
+
+
+def _without_lags(case: PeriodicCase, bare: Case, excitation: Excitation, prior: LagPrior) -> Finding:
+    """Return the finding of the same periodic samples with another statement of the lags. Raises Refused."""
+    other = replace(bare, recording=replace(bare.recording, lag_prior=prior))
+    return _again(other, excitation, case, case.samples)[1]
+
+
+def _recorded_again(case: Case, prior: LagPrior) -> Finding:
+    """Return the finding of the same record with another statement of the lags. Raises Refused."""
+    return identify_record(replace(case, recording=replace(case.recording, lag_prior=prior)))
 
 
 def sampled(case: Case) -> Case:
