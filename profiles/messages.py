@@ -201,6 +201,10 @@ class MessageCode(Enum):
         65, "The calibration factor includes the loss of a gear",
         "The torque sensor is behind the gear, and the torque that the gear loses counts as an error of the drive.",
         "Measure at the motor shaft, or note pairs with rising and with falling torque at standstill.")
+    DISTORTION_FOUND = (
+        66, "The response has nonlinear distortion of unknown cause",
+        "Torque and speed have harmonics that no linear shaft makes, or the response differs between the mean speeds.",
+        "Show the harmonics with tdhil frf. Check coupling and gear for play, and measure again with --realisations 2.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (

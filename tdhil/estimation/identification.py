@@ -21,7 +21,7 @@ from tdhil.estimation.cross_checks import (
     torques_judged,
 )
 from tdhil.estimation.data_checks import check_known, check_samples
-from tdhil.estimation.frequency_domain import measure_response
+from tdhil.estimation.frequency_domain import distortion_warning, measure_response
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
@@ -61,8 +61,9 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     finding = jump_checked(level_checked(angle_checked(finding, case), case), case)
     found = conclude(case, stretched(finding, case.recording))
     if isinstance(case, PeriodicCase):
-        found = replace(
-            found, frequency_response=measure_response(case, seen.curve, seen.settled, seen.model))
+        response = measure_response(case, seen.curve, seen.settled, seen.model)
+        found = replace(found, frequency_response=response,
+                        warnings=(*found.warnings, *distortion_warning(response, found.warnings)))
     return replace(found, impedance=_impedance(case, finding, found))
 
 
