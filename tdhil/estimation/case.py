@@ -136,7 +136,7 @@ class Finding(ModelResult):
         return Finding(
             model=self.model, words=self.words, residual=self.residual, lines=self.lines,
             samples_used=self.samples_used, warnings=self.warnings, contradiction=contradiction,
-            bent=self.bent, harmonics=self.harmonics, backlash=self.backlash,
+            bent=self.bent, harmonics=self.harmonics, least_harmonics=self.least_harmonics, backlash=self.backlash,
         )
 
     @property

@@ -214,6 +214,14 @@ class AngleHarmonic:
 
 
 @dataclass(frozen=True)
+class LeastHarmonic:
+    """Least amplitude of an order that the recording would show in 95 of 100 runs."""
+
+    order: int
+    amplitude_nm: float
+
+
+@dataclass(frozen=True)
 class Backlash:
     """Play of a coupling or a gear behind the motor, from flank to flank, at the motor shaft, rad.
 
@@ -526,6 +534,7 @@ class ModelResult:
     friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
     compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
     harmonics: tuple[AngleHarmonic, ...] | None = None  # of the shaft's angle, the largest first; None: not known
+    least_harmonics: tuple[LeastHarmonic, ...] | None = None     # detection limits, by order; None: not known
     backlash: tuple[Backlash, ...] | None = None        # of the coupling; empty: none found; None: not known
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
 

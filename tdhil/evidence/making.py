@@ -48,8 +48,8 @@ _INTERVAL: Final = ("value", "low", "high", "low_total", "high_total")
 _MAY_LACK: Final = frozenset({
     "backlash", "calibration_advised", "coulomb_nm.high_total", "coulomb_nm.low_total", "customer",
     "frequency_response.lines.impedance_magnitude", "frequency_response.lines.impedance_phase_rad", "inertia_scope",
-    "order_number", "place", "speed_loop_present", "torque_scale_rel_sd", "viscous_nm_s_rad.high_total",
-    "viscous_nm_s_rad.low_total",
+    "least_harmonics", "order_number", "place", "speed_loop_present", "torque_scale_rel_sd",
+    "viscous_nm_s_rad.high_total", "viscous_nm_s_rad.low_total",
 })
 """Keys that version 0.1.0 has since a later state. An archive of an earlier state lacks them."""
 _MAY_DIFFER: Final[Mapping[str, str]] = {

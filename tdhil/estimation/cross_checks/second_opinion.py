@@ -126,7 +126,7 @@ def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) 
 
 
 def _swing_s(finding: Finding) -> float:
-    """Return the period in which the load of a compliant shaft oscillates while the motor's speed is held, s; else 0."""
+    """Return the period in which the load of a compliant shaft oscillates at constant speed of the motor, s; else 0."""
     shaft = finding.compliant
     known = None if shaft is None else shaft.antiresonance_hz or shaft.resonance_hz
     return 0.0 if known is None or not known.value > 0.0 else 1.0 / known.value
