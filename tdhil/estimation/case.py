@@ -137,6 +137,7 @@ class Finding(ModelResult):
             model=self.model, words=self.words, residual=self.residual, lines=self.lines,
             samples_used=self.samples_used, warnings=self.warnings, contradiction=contradiction,
             bent=self.bent, harmonics=self.harmonics, least_harmonics=self.least_harmonics, backlash=self.backlash,
+            backlash_motion=self.backlash_motion,
         )
 
     @property

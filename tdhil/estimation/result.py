@@ -514,6 +514,18 @@ class Refused(Exception):
         self.refusal = Refusal(reason, advice, entry)
 
 
+@dataclass(frozen=True)
+class PlayMotion:
+    """Whether the motion can show a play: the load crosses it where the torque on the load reverses.
+
+    ``least_torque_nm``: least torque of the drive along the rotation, by the excited lines. Below 0 the drive brakes
+    the shaft, and a load with its share of inertia and friction drives the motor.
+    """
+
+    torque_reverses: bool
+    least_torque_nm: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelResult:
     """Quantities of one model, which a route finds and the identification reports.
@@ -536,6 +548,7 @@ class ModelResult:
     harmonics: tuple[AngleHarmonic, ...] | None = None  # of the shaft's angle, the largest first; None: not known
     least_harmonics: tuple[LeastHarmonic, ...] | None = None     # detection limits, by order; None: not known
     backlash: tuple[Backlash, ...] | None = None        # of the coupling; empty: none found; None: not known
+    backlash_motion: PlayMotion | None = None           # None where ``backlash`` is
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
 
     def quantities(self) -> dict[str, Any]:

@@ -143,6 +143,8 @@ def backlash_rows(document: Mapping[str, Any]) -> Iterator[Row]:
             yield BACKLASH.on_card, "found, size not known"
         else:
             yield BACKLASH.on_card, f"{estimate_text(in_milliradians(play), BACKLASH.unit)}, at the motor shaft"
+    if (motion := document.get("backlash_motion")) and not document["backlash"] and not motion["torque_reverses"]:
+        yield BACKLASH.on_card, f"may be hidden: the torque stays above {motion['least_torque_nm']:.2g} N·m"
 
 
 def in_milliradians(part: Mapping[str, Any]) -> dict[str, float]:

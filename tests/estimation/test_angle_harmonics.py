@@ -98,7 +98,8 @@ def test_nothing_changes_without_a_harmonic():
     for recording in recorded(0, 0.0):
         found, before = identify(recording), identify(replace(recording, position_rad=None))
         assert found.harmonics == found.backlash == ()
-        unknown = replace(found, harmonics=None, least_harmonics=None, backlash=None, frequency_response=None)
+        unknown = replace(found, harmonics=None, least_harmonics=None, backlash=None, backlash_motion=None,
+                          frequency_response=None)
         assert unknown == replace(before, frequency_response=None)
 
 
