@@ -125,8 +125,8 @@ def harmonic_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         amplitude, phase = estimate_text(one["amplitude_nm"], "N·m"), in_degrees(one["phase_rad"])
         yield title, f"order {one['order']}: {amplitude}, phase {plus_minus_part(phase)}°"
         title = ""
-    if least := least_harmonics(document):
-        yield title, f"{'none found; ' * bool(title)}would show {least}"
+    if not title and (least := least_harmonics(document)):
+        yield title, f"would show {least}"
 
 
 def least_harmonics(document: Mapping[str, Any]) -> str:
