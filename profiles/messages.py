@@ -929,9 +929,7 @@ def with_code(text: str, code: str) -> str:
 
 
 def message_of(code: str) -> MessageCode | None:
-    """Return the entry of a code as a user types it: ``TDH-412``, ``tdh412`` or ``412``; None if no such
-    code exists.
-    """
+    """Return the entry of a code as a user types it: ``TDH-412``, ``tdh412`` or ``412``; None for no code."""
     digits = code.strip().upper().removeprefix("TDH").removeprefix("-")
     if not digits.isdecimal():
         return None
