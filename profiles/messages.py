@@ -209,6 +209,10 @@ class MessageCode(Enum):
         67, "The result does not explain its nonlinear distortion",
         "The margins are those of a linear shaft. No backlash, friction or torque over the angle explains the rest.",
         "Look for the cause with tdhil frf, and start with half of P.")
+    DISTORTION_FOUND = (
+        68, "The response has nonlinear distortion of unknown cause",
+        "Torque and speed have harmonics that no linear shaft makes, or the response differs between the mean speeds.",
+        "Show the harmonics with tdhil frf. Check coupling and gear for play, and measure again with --realisations 2.")
 
     # --- 1xx: internal error -----------------------------------------------------------------------------------------
     INTERNAL_ERROR = (
@@ -933,9 +937,7 @@ def with_code(text: str, code: str) -> str:
 
 
 def message_of(code: str) -> MessageCode | None:
-    """Return the entry of a code as a user types it: ``TDH-412``, ``tdh412`` or ``412``; None if no such
-    code exists.
-    """
+    """Return the entry of a code as a user types it: ``TDH-412``, ``tdh412`` or ``412``; None for no code."""
     digits = code.strip().upper().removeprefix("TDH").removeprefix("-")
     if not digits.isdecimal():
         return None

@@ -36,10 +36,10 @@ from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.cubic_spline import CubicSpline
 from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segment_means, widened
-from tdhil.estimation.result import AngleHarmonic, Estimate, normal_quantile
+from tdhil.estimation.result import AngleHarmonic, Estimate, LeastHarmonic, normal_quantile
 from tdhil.estimation.samples import ALL_TIME, LONGEST_GAP, Samples, Stretch, angle_readings, usual_interval
 from tdhil.estimation.spectrum import ComplexArray, unit_waves
-from tdhil.recording import FloatArray, Recording
+from tdhil.recording import BoolArray, FloatArray, IntArray, Recording
 
 LEAST_GAIN = 40.0
 """Least decrease of −2 ln L by the two parameters of an order. For white noise the probability of as much by chance is
@@ -52,6 +52,9 @@ with the angle, so that no fit averages it out: over an hour it made orders of 0
 
 MOST_ORDERS = 8
 """Most orders in one fit."""
+
+LEAST_ORDERS = (1, 2, 3, 4, 6, 8, 12, 18, 24, 36, 48, 72)
+"""Orders whose detection limit is stated: eccentricity, and usual numbers of poles and slots."""
 
 HIGHEST_ORDER = 256
 """Highest order tested."""
@@ -78,6 +81,7 @@ _SETTLED_S = 20.0         # s; after this time the longest filter has settled
 _SEEN_SHARE = 0.98        # share of the time in which an order must be inside the used band
 _BLOCK_S = 2.0            # s; blocks of time whose scores are independent: longer than load and filters remember
 _SAME_RAD = 1e-9          # rad: a smaller difference of two readings is rounding of the arithmetic
+_HIDES = normal_quantile(0.9)      # sd of the noise that hides an order of a larger amplitude in 5 of 100 runs
 _SMALL = 1e-12            # relative: smaller eigenvalues of the normal matrix count as zero
 
 
@@ -417,12 +421,8 @@ def _candidates(seen: tuple[_WeighedSegment, ...], torque: HarmonicTorque | None
         place = np.floor(np.mod(segment.angle_rad, 2.0 * np.pi) * (_BINS / (2.0 * np.pi))).astype(np.int64) % _BINS
         mean = np.fft.rfft(np.bincount(place, weights=signal, minlength=_BINS))[: HIGHEST_ORDER + 1]
         sums += count * mean * np.exp(-1j * np.pi * orders / _BINS)
-        # frequency of an order, in lines of the segment's spectrum: n dθ N/2π, with dθ the angle of one step
-        weights, edges = np.histogram(np.abs(np.gradient(segment.angle_rad)), bins=64, weights=segment.taper**2)
-        rate = 0.5 * (edges[1:] + edges[:-1])
-        places = np.multiply.outer(orders, rate) * (count / (2.0 * np.pi)) - segment.chosen.start
+        places, inside, weights = _places(segment, orders)
         sensitivity = np.abs(one.through) ** 2 / one.noise
-        inside = (places >= 0.0) & (places <= len(sensitivity) - 1.0)
         at = np.interp(places, np.arange(len(sensitivity)), sensitivity)
         energy += 0.5 * count * (np.where(inside, at, 0.0) @ weights)
         whole_band += inside @ weights
@@ -432,6 +432,32 @@ def _candidates(seen: tuple[_WeighedSegment, ...], torque: HarmonicTorque | None
     known = set() if torque is None else set(torque.orders)
     likely = [int(n) for n in np.argsort(-gain) if gain[n] > _FIRST_LOOK * LEAST_GAIN and int(n) not in known]
     return likely[:MOST_ORDERS]
+
+
+def _places(segment: _GridSegment, orders: IntArray) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Return the frequencies of orders, in lines of the used band, (O, B) for B speeds; whether they are inside; the
+    share of time (B,) of the speeds.
+    """
+    # in lines of the segment's spectrum: n dθ N/2π, with dθ the angle of one step
+    weights, edges = np.histogram(np.abs(np.gradient(segment.angle_rad)), bins=64, weights=segment.taper**2)
+    rate = 0.5 * (edges[1:] + edges[:-1])
+    places = np.multiply.outer(orders, rate) * (len(segment.angle_rad) / (2.0 * np.pi)) - segment.chosen.start
+    return places, (places >= 0.0) & (places <= len(segment.hertz) - 1.0), weights
+
+
+def _least(view: _View, torque: HarmonicTorque | None) -> tuple[LeastHarmonic, ...]:
+    """Return the detection limits of `LEAST_ORDERS`, as far as the used band has them: the limit of the search, and
+    above it the part of the noise that may hide an order.
+    """
+    seen, orders = view.weighted(torque), np.array(LEAST_ORDERS)
+    found = [_places(one.segment, orders) for one in seen]
+    share = sum(inside @ weights for _, inside, weights in found) / sum(float(np.sum(one)) for *_, one in found)
+    known = () if torque is None else torque.orders
+    looked_for = [int(n) for n in orders[share >= _SEEN_SHARE]]
+    fitted = _fit(seen, (*known, *(n for n in looked_for if n not in known)))
+    variance = dict(zip(fitted.orders, np.diag(fitted.covariance).reshape(-1, 2).mean(axis=1).tolist(), strict=True))
+    return tuple(LeastHarmonic(n, max(math.sqrt(LEAST_GAIN * variance[n]), view.least_nm(n))
+                               + _HIDES * math.sqrt(variance[n])) for n in looked_for if variance[n] > 0.0)
 
 
 def _search(view: _View) -> HarmonicTorque | None:
@@ -639,8 +665,9 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
     long = any(one is not stretch for one, stretch in zip(first, case.stretches, strict=True))
     seen = _SeenAngle.of(case, first if long else case.stretches)
     if seen is not None and long:
-        if _search(seen.view(_FittedShaft.of(seen.lines, curve))) is None:
-            return case, replace(finding, harmonics=())
+        view = seen.view(_FittedShaft.of(seen.lines, curve))
+        if _search(view) is None:
+            return case, replace(finding, harmonics=(), least_harmonics=_least(view, None))
         seen = _SeenAngle.of(case, case.stretches)
     if seen is None:
         return case, finding
@@ -649,7 +676,7 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
         model = _FittedShaft.of(seen.lines, curve)
         torque = _fitted(seen, model)
         if torque is None:
-            return case, replace(finding, harmonics=())
+            return case, replace(finding, harmonics=(), least_harmonics=_least(seen.view(model), None))
         clean = replace(raw, torque_nm=raw.torque_nm - _through_filter(raw, seen.angle, torque, model))
         case, finding = again(clean)
         if not isinstance(finding.curve, ModelCurve):
@@ -657,4 +684,5 @@ def without_harmonics(case: PeriodicCase, finding: Finding, again: Again) -> tup
         curve = finding.curve
     assert torque is not None
     finding = _widened(case, finding, seen.segments, torque, model.delay_s)
-    return case, replace(finding, harmonics=torque.estimates(case.options.confidence))
+    return case, replace(finding, harmonics=torque.estimates(case.options.confidence),
+                         least_harmonics=_least(seen.view(model), torque))

@@ -49,9 +49,9 @@ from profiles.quantities import printed_interval
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import ModelCurve, filters
 from tdhil.estimation.line_influence import LEAST_PERIODS, inertia_changes, segment_means, widened
-from tdhil.estimation.result import Backlash, Estimate, Refusal, normal_quantile
+from tdhil.estimation.result import Backlash, Estimate, PlayMotion, Refusal, normal_quantile
 from tdhil.estimation.samples import Samples, Stretch, angle_readings, thinned
-from tdhil.estimation.spectrum import ComplexArray
+from tdhil.estimation.spectrum import ComplexArray, unit_waves
 from tdhil.recording import FloatArray, IntArray, Segment
 
 LEAST_GAIN = 60.0
@@ -276,10 +276,23 @@ def with_backlash(case: PeriodicCase, finding: Finding) -> Finding:
     if not segments:
         return finding
     fitted = _fitted(_AllSegments(tuple(segments.values())))
+    finding = replace(finding, backlash_motion=_play_motion(case))
     if fitted is None:
         return replace(finding, backlash=())
     found = fitted.estimate(case.options.confidence)
     return _widened(replace(finding, backlash=(found,)), case, segments, fitted, found)
+
+
+def _play_motion(case: PeriodicCase) -> PlayMotion:
+    """Return the least torque of the excited motion along the rotation, by its lines."""
+    least = []
+    for stretch, fit in zip(case.stretches, case.fits, strict=True):
+        if len(fit.torque):
+            time = np.linspace(0.0, stretch.segment.period_s, _STEPS)
+            waves = unit_waves(2.0 * np.pi * np.multiply.outer(time, np.array(fit.lines_hz)))
+            torque = fit.torque_mean.mean() + (waves @ fit.torque.mean(axis=0)).real
+            least.append(float(np.min(torque * np.sign(fit.speed_mean.mean()))))
+    return PlayMotion(min(least) < 0.0, min(least))
 
 
 def _widened(

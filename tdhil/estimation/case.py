@@ -53,7 +53,8 @@ class PeriodicCase(Case):
     """Case with periodic excitation: its whole periods, their spectral lines, and B from the mean operating points.
 
     ``every``: the lines pooled over the segments. ``lines``: those where both signals are clear of the scatter;
-    ``usable``: those where at least one signal is.
+    ``usable``: those where at least one signal is. ``undeclared``: warnings of undeclared motion in
+    the reported samples.
     """
 
     levels: Levels
@@ -61,6 +62,7 @@ class PeriodicCase(Case):
     fits: tuple[PeriodLines, ...]
     constraint: ViscousConstraint | None
     every: tuple[SpectralLine, ...]
+    undeclared: tuple[str, ...] = ()
     lines: tuple[SpectralLine, ...] = ()
     usable: tuple[SpectralLine, ...] = ()
 
@@ -134,7 +136,8 @@ class Finding(ModelResult):
         return Finding(
             model=self.model, words=self.words, residual=self.residual, lines=self.lines,
             samples_used=self.samples_used, warnings=self.warnings, contradiction=contradiction,
-            bent=self.bent, harmonics=self.harmonics, backlash=self.backlash,
+            bent=self.bent, harmonics=self.harmonics, least_harmonics=self.least_harmonics, backlash=self.backlash,
+            backlash_motion=self.backlash_motion,
         )
 
     @property

@@ -191,7 +191,8 @@ def _gain(turning: list[tuple[FloatArray, FloatArray, ComplexArray]], trial: Flo
 # Causes: a limit cycle, a resonance that noise excites, aliased ripple, another machine, or lines that differ from
 # excitation.yaml. It does not bias the declared lines by itself: within whole periods it is orthogonal to them, or its
 # phase changes from period to period, so that it is scatter. The report states it nevertheless, because an aliased line
-# may be at any frequency.
+# may be at any frequency. Only reported samples are checked: a torque that was subtracted afterwards, such as that of
+# the harmonics of the angle, is no motion.
 #
 # The signal is averaged in bins of a twentieth of the fastest declared cycle, without each period's mean and drift and
 # without the segment's own mean lines. The rest gives the periodogram. For noise, a bin is exponentially distributed
@@ -312,8 +313,6 @@ def check_lines(case: PeriodicCase) -> None:
     check_standstill(parts, case.recording.speed_resolution_rad_s)
 
 
-def hints(
-    recording: Recording, stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...], levels: Levels
-) -> tuple[str, ...]:
+def hints(recording: Recording, undeclared: tuple[str, ...], levels: Levels) -> tuple[str, ...]:
     """Return the warnings: faults of the data that do not invalidate the result."""
-    return (*left_out_warnings(recording), *undeclared_warning(stretches, fits), *warming_warning(levels.warming))
+    return (*left_out_warnings(recording), *undeclared, *warming_warning(levels.warming))

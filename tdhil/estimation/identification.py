@@ -21,15 +21,16 @@ from tdhil.estimation.cross_checks import (
     torques_judged,
 )
 from tdhil.estimation.data_checks import check_known, check_samples
-from tdhil.estimation.frequency_domain import measure_response
+from tdhil.estimation.frequency_domain import distortion_warning, measure_response
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.periodic import clear_lines, identify_lines, measured
 from tdhil.estimation.result import DriveImpedance, Identification, Options, Refused
 from tdhil.estimation.samples import Samples, excited_window, usable_samples
 from tdhil.estimation.setpoint_sampling import stretched
+from tdhil.estimation.stated_lags import with_lags_checked
 from tdhil.estimation.time_domain import identify_record, recorded
-from tdhil.recording import Excitation, Recording, aborted_stage, before_abort
+from tdhil.recording import Excitation, LagPrior, Recording, aborted_stage, before_abort
 
 
 def identify(recording: Recording, options: Options | None = None) -> Identification:
@@ -42,14 +43,16 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         if excitation is None or not excitation.segments:
             case = recorded(case)
             finding = identify_record(case)
+            finding = with_lags_checked(case, finding, partial(_recorded_again, case))
         else:
             # the case is built step by step, so that a refusal contains the counts so far
             bare = case
             case = periodic = measured(case, excitation)
             case = periodic = clear_lines(periodic)
             finding = identify_lines(periodic)
-            case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation))
+            case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation, periodic))
             finding = with_backlash(case, finding)
+            finding = with_lags_checked(case, finding, partial(_without_lags, case, bare, excitation))
     except Refused as refused:
         finding = Finding(refusal=refused.refusal)
     seen = finding
@@ -58,8 +61,9 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     finding = jump_checked(level_checked(angle_checked(finding, case), case), case)
     found = conclude(case, stretched(finding, case.recording))
     if isinstance(case, PeriodicCase):
-        found = replace(
-            found, frequency_response=measure_response(case, seen.curve, seen.settled, seen.model))
+        response = measure_response(case, seen.curve, seen.settled, seen.model)
+        found = replace(found, frequency_response=response,
+                        warnings=(*found.warnings, *distortion_warning(response, found.warnings)))
     return replace(found, impedance=_impedance(case, finding, found))
 
 
@@ -75,10 +79,23 @@ def _impedance(case: Case, finding: Finding, found: Identification) -> DriveImpe
     return refusal(asked, finding.refusal.reason, finding.refusal.advice)
 
 
-def _again(case: Case, excitation: Excitation, samples: Samples) -> tuple[PeriodicCase, Finding]:
+def _again(
+    case: Case, excitation: Excitation, reported: PeriodicCase, samples: Samples
+) -> tuple[PeriodicCase, Finding]:
     """Return the periodic case with other samples, and its finding. Raises Refused as the first time."""
-    found = clear_lines(measured(replace(case, samples=samples), excitation))
+    found = clear_lines(measured(replace(case, samples=samples), excitation, reported))
     return found, identify_lines(found)
+
+
+def _without_lags(case: PeriodicCase, bare: Case, excitation: Excitation, prior: LagPrior) -> Finding:
+    """Return the finding of the same periodic samples with another statement of the lags. Raises Refused."""
+    other = replace(bare, recording=replace(bare.recording, lag_prior=prior))
+    return _again(other, excitation, case, case.samples)[1]
+
+
+def _recorded_again(case: Case, prior: LagPrior) -> Finding:
+    """Return the finding of the same record with another statement of the lags. Raises Refused."""
+    return identify_record(replace(case, recording=replace(case.recording, lag_prior=prior)))
 
 
 def sampled(case: Case) -> Case:

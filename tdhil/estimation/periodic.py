@@ -26,7 +26,7 @@ from tdhil.estimation.candidates import (
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.cross_checks import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
-from tdhil.estimation.excitation_checks import check_lines, hints
+from tdhil.estimation.excitation_checks import check_lines, hints, undeclared_warning
 from tdhil.estimation.frequency_domain import (
     LEAST_NU,
     RigidResult,
@@ -63,9 +63,9 @@ _ONE_LINE = Refusal(
 )
 
 
-def measured(case: Case, excitation: Excitation) -> PeriodicCase:
+def measured(case: Case, excitation: Excitation, reported: PeriodicCase | None = None) -> PeriodicCase:
     """Return the case with its whole periods, their lines, and B from the levels. Raises Refused without free
-    motion.
+    motion. ``reported``: the case of the samples as reported, if those of ``case`` are corrected ones.
     """
     recording, samples = case.recording, case.samples
     check_motion(recording, excitation, samples)
@@ -75,6 +75,7 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
     rough = _rough(fits)
     levels = measure_levels(cut, fits, samples, recording.levels, rough)
     constraint = _tie(case, levels, rough)
+    undeclared = undeclared_warning(cut, fits) if reported is None else reported.undeclared
     return PeriodicCase(
         recording=recording,
         options=case.options,
@@ -83,13 +84,14 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
         paper=case.paper,
         periods_used=sum(len(stretch.periods) for stretch in cut),
         samples_used=sum(len(period) for stretch in cut for period in stretch.periods),
-        warnings=(*case.warnings, *log_warnings(recording), *_warnings(cut), *hints(recording, cut, fits, levels)),
+        warnings=(*case.warnings, *log_warnings(recording), *_warnings(cut), *hints(recording, undeclared, levels)),
         levels=levels,
         torque_ratios=case.torque_ratios,
         stretches=cut,
         fits=fits,
         constraint=constraint,
         every=pooled_lines(fits, constraint.slope if constraint is not None else 0.0, levels.warming.own),
+        undeclared=undeclared,
     )
 
 

@@ -214,6 +214,14 @@ class AngleHarmonic:
 
 
 @dataclass(frozen=True)
+class LeastHarmonic:
+    """Least amplitude of an order that the recording would show in 95 of 100 runs."""
+
+    order: int
+    amplitude_nm: float
+
+
+@dataclass(frozen=True)
 class Backlash:
     """Play of a coupling or a gear behind the motor, from flank to flank, at the motor shaft, rad.
 
@@ -506,6 +514,18 @@ class Refused(Exception):
         self.refusal = Refusal(reason, advice, entry)
 
 
+@dataclass(frozen=True)
+class PlayMotion:
+    """Whether the motion can show a play: the load crosses it where the torque on the load reverses.
+
+    ``least_torque_nm``: least torque of the drive along the rotation, by the excited lines. Below 0 the drive brakes
+    the shaft, and a load with its share of inertia and friction drives the motor.
+    """
+
+    torque_reverses: bool
+    least_torque_nm: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelResult:
     """Quantities of one model, which a route finds and the identification reports.
@@ -526,7 +546,9 @@ class ModelResult:
     friction_curve: tuple[FrictionPoint, ...] = ()      # in order of speed; empty with fewer than three speeds
     compliant: Compliant | None = None                  # for the models two-mass and string; ``inertia`` is then J_r
     harmonics: tuple[AngleHarmonic, ...] | None = None  # of the shaft's angle, the largest first; None: not known
+    least_harmonics: tuple[LeastHarmonic, ...] | None = None     # detection limits, by order; None: not known
     backlash: tuple[Backlash, ...] | None = None        # of the coupling; empty: none found; None: not known
+    backlash_motion: PlayMotion | None = None           # None where ``backlash`` is
     lines: tuple[LinePoint, ...] = ()                   # in order of frequency; for the figure of the report
 
     def quantities(self) -> dict[str, Any]:

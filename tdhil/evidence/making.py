@@ -46,10 +46,11 @@ _MOST: Final = 1e300
 """Magnitude above which a stated value is no number: an integer of JSON may exceed every float."""
 _INTERVAL: Final = ("value", "low", "high", "low_total", "high_total")
 _MAY_LACK: Final = frozenset({
-    "backlash", "calibration_advised", "coulomb_nm.high_total", "coulomb_nm.low_total", "customer",
+    "backlash", "backlash_motion", "calibration_advised", "coulomb_nm.high_total", "coulomb_nm.low_total",
+    "customer",
     "frequency_response.lines.impedance_magnitude", "frequency_response.lines.impedance_phase_rad", "inertia_scope",
-    "order_number", "place", "speed_loop_present", "torque_scale_rel_sd", "viscous_nm_s_rad.high_total",
-    "viscous_nm_s_rad.low_total",
+    "least_harmonics", "order_number", "place", "speed_loop_present", "torque_scale_rel_sd",
+    "viscous_nm_s_rad.high_total", "viscous_nm_s_rad.low_total",
 })
 """Keys that version 0.1.0 has since a later state. An archive of an earlier state lacks them."""
 _MAY_DIFFER: Final[Mapping[str, str]] = {

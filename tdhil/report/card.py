@@ -125,6 +125,15 @@ def harmonic_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         amplitude, phase = estimate_text(one["amplitude_nm"], "N·m"), in_degrees(one["phase_rad"])
         yield title, f"order {one['order']}: {amplitude}, phase {plus_minus_part(phase)}°"
         title = ""
+    if not title and (least := least_harmonics(document)):
+        yield title, f"would show {least}"
+
+
+def least_harmonics(document: Mapping[str, Any]) -> str:
+    """Return the detection limits of a few orders, from the lowest to the highest; "" if there are none."""
+    limits = [one for one in document.get("least_harmonics") or () if one["order"] in (1, 6, 36)]
+    return ", ".join(
+        f"order {one['order']} from {printed_bound(one['amplitude_nm'], 2, up=True)} N·m" for one in limits)
 
 
 def backlash_rows(document: Mapping[str, Any]) -> Iterator[Row]:
@@ -134,6 +143,8 @@ def backlash_rows(document: Mapping[str, Any]) -> Iterator[Row]:
             yield BACKLASH.on_card, "found, size not known"
         else:
             yield BACKLASH.on_card, f"{estimate_text(in_milliradians(play), BACKLASH.unit)}, at the motor shaft"
+    if (motion := document.get("backlash_motion")) and not document["backlash"] and not motion["torque_reverses"]:
+        yield BACKLASH.on_card, f"may be hidden: the torque stays above {motion['least_torque_nm']:.2g} N·m"
 
 
 def in_milliradians(part: Mapping[str, Any]) -> dict[str, float]:

@@ -179,7 +179,9 @@ def result_document(
         "second_opinions": [asdict(opinion) for opinion in found.second_opinions],
         "friction_curve": [asdict(point) for point in found.friction_curve],
         "harmonics": None if found.harmonics is None else [asdict(one) for one in found.harmonics],
+        "least_harmonics": None if found.least_harmonics is None else [asdict(one) for one in found.least_harmonics],
         "backlash": None if found.backlash is None else [asdict(one) for one in found.backlash],
+        "backlash_motion": None if found.backlash_motion is None else asdict(found.backlash_motion),
         "compliant": None if (shaft := found.compliant) is None else {
             "motor_inertia_kg_m2": None if found.inertia is None else {     # the result's own inertia, J_r
                 name: getattr(found.inertia, name) for name in ("value", "low_total", "high_total", "low", "high")

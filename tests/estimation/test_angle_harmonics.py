@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from profiles import MessageCode
 from tdhil.estimation import angle_harmonics, identify
 from tdhil.estimation.angle_harmonics import HarmonicTorque
 from tests.estimation.angle_bench import RATED_NM, OverAngle, run_over_angle
@@ -46,6 +47,21 @@ def test_an_order_is_found_with_its_amplitude_and_phase(order, share):
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("order", [1, 6])
+def test_an_order_above_the_stated_limit_is_found_and_one_far_below_is_not(order):
+    limits = [{one.order: one.amplitude_nm for one in identify(recording).least_harmonics}
+              for recording in recorded(0, 0.0)]
+    assert limits[0][order] == pytest.approx(limits[1][order], rel=0.4)
+    assert limits[0][36] > 10.0 * limits[0][6]
+    for share, seen in ((1.2, [order]), (0.4, [])):
+        for recording in recorded(order, share * max(one[order] for one in limits) / RATED_NM):
+            found = identify(recording)
+            assert [one.order for one in found.harmonics] == seen
+            again = {one.order: one.amplitude_nm for one in found.least_harmonics}
+            assert again[order] == pytest.approx(limits[0][order], rel=0.4)
+
+
+@pytest.mark.heavy
 def test_the_harmonic_is_removed_from_the_inertia():
     """With 10 % of rated torque at order 1, the harmonic determines the scatter unless it is subtracted."""
     for clean, bent in zip(recorded(0, 0.0), recorded(1, 0.1), strict=True):
@@ -69,11 +85,21 @@ def test_another_model_may_be_selected_without_the_harmonic():
 
 
 @pytest.mark.heavy
+def test_the_subtracted_torque_is_no_undeclared_motion():
+    """The drive reports no torque of 0.68 Hz in this run. Only the torque without the harmonic has it."""
+    for recording in recorded(1, 0.1):
+        found = identify(recording)
+        assert [one.order for one in found.harmonics] == [1]
+        assert not any(one.entry is MessageCode.UNDECLARED_MOTION for one in found.warnings)
+
+
+@pytest.mark.heavy
 def test_nothing_changes_without_a_harmonic():
     for recording in recorded(0, 0.0):
         found, before = identify(recording), identify(replace(recording, position_rad=None))
         assert found.harmonics == found.backlash == ()
-        unknown = replace(found, harmonics=None, backlash=None, frequency_response=None)
+        unknown = replace(found, harmonics=None, least_harmonics=None, backlash=None, backlash_motion=None,
+                          frequency_response=None)
         assert unknown == replace(before, frequency_response=None)
 
 

@@ -48,6 +48,15 @@ def test_backlash_widens_the_interval_and_is_in_the_budget():
     assert 0.0 < line.half_width_kg_m2 < 0.01 * TRUE
 
 
+def test_the_result_states_whether_the_motion_can_show_a_play():
+    """A larger constant load keeps the torque of the drive positive. Then the load hardly crosses a play."""
+    recording = recorded(0.0)[0]
+    reversing, driving = identify(recording), identify(replace(recording, torque_nm=recording.torque_nm + 100.0))
+    assert reversing.backlash_motion.torque_reverses and not driving.backlash_motion.torque_reverses
+    assert driving.backlash_motion.least_torque_nm == pytest.approx(
+        reversing.backlash_motion.least_torque_nm + 100.0, abs=0.1)
+
+
 def test_an_elastic_coupling_without_play_has_none():
     for recording in recorded(0.0):
         assert identify(recording).backlash == ()

@@ -10,10 +10,10 @@ import control
 import numpy as np
 import pytest
 
-from profiles import MessageCode, UsageError
+from profiles import CodedText, MessageCode, UsageError
 from tdhil.estimation import Options, identify, response_columns, unit_of, usable_samples
 from tdhil.estimation.case import Case
-from tdhil.estimation.frequency_domain.frequency_response import _pooled, measure_response
+from tdhil.estimation.frequency_domain.frequency_response import _pooled, distortion_warning, measure_response
 from tdhil.estimation.periodic import measured
 from tdhil.estimation.spectrum import SpectralLine
 from tests.estimation.analytic import closed_form
@@ -133,6 +133,27 @@ def test_torque_at_an_unexcited_harmonic_is_distortion(harmonic, odd):
     assert (found.odd_share > 0.7) is odd
     seen = {one.harmonic: one for one in found.harmonics}[harmonic]
     assert seen.torque_nm == pytest.approx(2.0, rel=0.1) and seen.p_value < 1e-6
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("between_speeds", [False, True])
+def test_a_distortion_without_a_named_cause_is_a_warning_of_the_result(between_speeds):
+    plain = closed_form(noise=3.0)
+    speeds = [plain.speed_rad_s[(plain.time_s >= one.start_s) & (plain.time_s < one.end_s)] - one.offset_rad_s
+              for one in plain.excitation.segments]
+    bent = with_torque(plain, lambda t, number: 1.5 * number * speeds[number] if between_speeds else
+                       2.0 * np.cos(2.0 * np.pi * 0.5 * t + 0.4))
+    found = identify(bent)
+    (said,) = (one for one in found.warnings if getattr(one, "entry", None) is MessageCode.DISTORTION_FOUND)
+    assert ("between the mean speeds" if between_speeds else "Look for backlash") in said
+    assert f"p = {found.frequency_response.distortion.p_value:.1g}" in said
+
+
+def test_a_distortion_with_a_named_cause_and_a_linear_shaft_have_no_such_warning(linear):
+    bent = replace(linear, distortion=replace(linear.distortion, detected=True))
+    assert distortion_warning(linear, ()) == distortion_warning(None, ()) == ()
+    assert len(distortion_warning(bent, ("a plain text",))) == 1
+    assert distortion_warning(bent, (CodedText("backlash", MessageCode.BACKLASH_FOUND),)) == ()
 
 
 @pytest.mark.heavy

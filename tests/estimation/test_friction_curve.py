@@ -1,12 +1,15 @@
 """Friction over speed: every point covers, and nonlinear friction is found if present and rarely if absent."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 from sim_bus.inverter import Inverter
-from sim_bus.params import RigParams
+from sim_bus.params import DriveParams, RigParams
 from sim_bus.plant.rigid import Params
+from sim_bus.plant.two_mass import TwoMassParams
 from tdhil.estimation import Options
 from tdhil.estimation.cross_checks.friction_by_speed import FrictionCurve, Inertia, friction_curve
 from tdhil.estimation.cross_checks.momentum_fit import Delay
@@ -23,9 +26,9 @@ STRIBECK = Params(friction="stribeck", static_nm=100.0, stribeck_speed_rad_s=3.0
 SPEEDS = (2.0, 3.0, 4.5, 6.0, 8.0)
 
 
-def held(plant, seed, speeds=SPEEDS, hold_s=14.0):
+def held(plant, seed, speeds=SPEEDS, hold_s=14.0, drive=None):
     """Return the 100 Hz reports of the simulated drive in speed mode at one speed after the other."""
-    inverter = Inverter(RigParams(plant=plant), np.random.default_rng(seed))
+    inverter = Inverter(RigParams(plant=plant, drive=drive or DriveParams()), np.random.default_rng(seed))
     rows, now = [], 0.0
     count, step = inverter.steps(0.01)
     for speed in speeds:
@@ -38,9 +41,9 @@ def held(plant, seed, speeds=SPEEDS, hold_s=14.0):
     return recorded(*np.array(rows).T.copy())
 
 
-def curve_of(recording, density=9.0, dof=18.0):
+def curve_of(recording, density=9.0, dof=18.0, inertia=KNOWN):
     known = Levels(np.array([3.0, 7.0]), np.zeros(2), np.zeros(2), np.full(2, 100.0), density, dof)
-    return friction_curve(recording, usable_samples(recording), known, KNOWN, Options())
+    return friction_curve(recording, usable_samples(recording), known, inertia, Options())
 
 
 def true_friction(plant, speed):
@@ -64,6 +67,20 @@ def test_points_cover_and_nonlinear_friction_is_reported(plant, bends):
         assert bool(curve.warnings) is curve.bent
     assert covered >= binom.ppf(0.005, points, 0.95)
     assert bent >= 11 if bends else bent <= 1
+
+
+@pytest.mark.heavy
+def test_a_load_that_still_oscillates_does_not_make_friction_nonlinear():
+    """At the ends of a stretch the load of two masses has another speed than the motor, for half a minute."""
+    two, drive = TwoMassParams(), DriveParams(torque_limit_nm=8000.0, speed_gain_nm_s_rad=3000.0,
+                                              speed_integral_gain_nm_rad=2000.0)
+    whole = replace(KNOWN, value=two.inertia_kg_m2 + two.bottom.inertia_kg_m2, sd=2.0)
+    swing_s = 2.0 * np.pi * (two.bottom.inertia_kg_m2 / two.stiffness_nm_rad) ** 0.5
+    for seed in range(2):
+        recording = held(two, seed, (2.5, 4.0, 6.0, 8.0), 20.0, drive)
+        assert curve_of(recording, 30.0, inertia=whole).bent
+        curve = curve_of(recording, 30.0, inertia=replace(whole, swing_s=swing_s))
+        assert not curve.bent and len(curve.points) == 4
 
 
 @pytest.mark.heavy

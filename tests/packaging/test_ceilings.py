@@ -16,7 +16,7 @@ CEILINGS = {
     "tdhil/calibration": (1_500, FIRST),
     "tdhil/cli": (6_700, "0095"),
     "tdhil/config": (1_800, FIRST),
-    "tdhil/estimation": (15_200, "0091"),
+    "tdhil/estimation": (15_300, "0096"),
     "tdhil/evidence": (1_400, FIRST),
     "tdhil/fleet": (2_200, "0089"),
     "tdhil/recording": (5_400, FIRST),

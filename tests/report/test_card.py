@@ -9,11 +9,14 @@ import pytest
 from rich.console import Console
 
 from profiles.quantities import printed_interval, printed_share
+from tdhil.estimation.result import AngleHarmonic, Estimate, LeastHarmonic, PlayMotion
 from tdhil.report.blocks import report_of
 from tdhil.report.card import (
+    backlash_rows,
     budget_figures,
     card_text,
     estimate_text,
+    harmonic_rows,
     inertia_text,
     opinion_rows,
     print_card,
@@ -178,3 +181,21 @@ def test_a_cross_check_without_a_j_beside_it_says_so():
     (row,) = opinion_rows({"second_opinions": [
         {"route": "speed change", "agrees": None, "inertia_kg_m2": {"value": 104.0, "low": 100.0, "high": 108.0}}]})
     assert "  not compared: the run gives no J, speed change" in row[1].plain
+
+
+def test_the_limits_of_harmonics_and_a_motion_that_hides_a_play_are_rows():
+    limits = (LeastHarmonic(1, 1.18), LeastHarmonic(2, 0.6), LeastHarmonic(6, 1.31), LeastHarmonic(36, 42.1))
+    one = AngleHarmonic(2, Estimate(5.0, 4.5, 5.5), Estimate(0.1, 0.0, 0.2))
+    found = replace(full(), harmonics=(one,), least_harmonics=limits, backlash=(),
+                    backlash_motion=PlayMotion(False, 8.42))
+    document = result_document(found, recording(), {}, "run.mcap")
+    assert list(harmonic_rows(document))[1] == (
+        "", "would show order 1 from 1.2 N·m, order 6 from 1.4 N·m, order 36 from 43 N·m")
+    assert list(backlash_rows(document)) == [("backlash", "may be hidden: the torque stays above 8.4 N·m")]
+    assert document["least_harmonics"][0] == {"order": 1, "amplitude_nm": 1.18}
+    assert document["backlash_motion"] == {"torque_reverses": False, "least_torque_nm": 8.42}
+    texts = str(report_of(document, recording()))
+    assert "This motion shows order 1 from 1.2 N·m" in texts
+    reversing = document | {"harmonics": [], "backlash_motion": {"torque_reverses": True, "least_torque_nm": -8.0}}
+    assert not list(backlash_rows(reversing)) and not list(harmonic_rows(reversing))
+    assert "No order stands out. This motion shows order 1" in str(report_of(reversing, recording()))

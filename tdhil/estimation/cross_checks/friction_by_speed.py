@@ -26,6 +26,7 @@ from tdhil.estimation.cross_checks.momentum import (
     KNOT_S,
     BalanceKind,
     BalanceRow,
+    Span,
     balances,
     block_means,
     drifting_spans,
@@ -46,15 +47,20 @@ from tdhil.recording import FloatArray, Recording
 
 
 _ALIKE = 0.01             # share of the highest speed: closer speeds are merged
+_SWING_LEFT = 0.25        # share that knots of one period leave if it is 10 % off, and the oscillation decays
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """Known J, kg·m², rough or final, with its standard deviation, and the delay between the reports."""
+    """Known J, kg·m², rough or final, with its standard deviation, and the delay between the reports.
+
+    ``swing_s``: period in which the load of a compliant shaft oscillates; 0 for a rigid one.
+    """
 
     value: float
     sd: float
     delay: Delay = UNKNOWN_DELAY
+    swing_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,10 @@ def steady_points(recording: Recording, samples: Samples, inertia: Inertia, dens
     found = []
     for span in drifting_spans(blocks, segments):
         row = through(samples, span.start_s, span.end_s, min(KNOT_S, span.duration_s / 4.0))
-        found += [_point(row, inertia, density, 0.0)] if row is not None else []
+        point = None if row is None else _point(row, inertia, density, 0.0)
+        if point is not None and inertia.swing_s > 0.0:
+            point = _without_swing(samples, span, inertia, density, point)
+        found += [point] if point is not None else []
     for segment in segments:
         start, end = excited_window(segment)
         whole = math.floor((end - start) / segment.period_s + 1e-6)
@@ -86,6 +95,23 @@ def steady_points(recording: Recording, samples: Samples, inertia: Inertia, dens
         swing = 0.5 * sum(a * a for a in segment.amplitudes_rad_s)
         found += [_point(row, inertia, density, max(swing, 1e-12))] if row is not None else []
     return found
+
+
+def _without_swing(
+    samples: Samples, span: Span, inertia: Inertia, density: float, short: FrictionStretch
+) -> FrictionStretch | None:
+    """Return the point of a stretch at whose ends the load still oscillates; None if it is too short.
+
+    The momentum of the load is not that of J at the motor's speed. Over knots of one period it is, up to `_SWING_LEFT`
+    of what the knots change. ``short``: the point with the usual knots.
+    """
+    if span.duration_s < 2.0 * inertia.swing_s:
+        return None
+    row = through(samples, span.start_s, span.end_s, max(KNOT_S, inertia.swing_s))
+    if row is None:
+        return None
+    point = _point(row, inertia, density, 0.0)
+    return replace(point, variance=point.variance + (_SWING_LEFT * (point.torque - short.torque)) ** 2)
 
 
 def _point(row: BalanceRow, inertia: Inertia, density: float, swing: float) -> FrictionStretch:

@@ -122,7 +122,14 @@ def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) 
         return None
     sd = _sd(case, known)
     finite = math.isfinite(known.value) and math.isfinite(sd)
-    return Inertia(known.value, sd, _known_delay(case, finding)) if finite else None
+    return Inertia(known.value, sd, _known_delay(case, finding), _swing_s(finding)) if finite else None
+
+
+def _swing_s(finding: Finding) -> float:
+    """Return the period in which the load of a compliant shaft oscillates at constant speed of the motor, s; else 0."""
+    shaft = finding.compliant
+    known = None if shaft is None else shaft.antiresonance_hz or shaft.resonance_hz
+    return 0.0 if known is None or not known.value > 0.0 else 1.0 / known.value
 
 
 def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:

@@ -17,7 +17,7 @@ from tdhil.estimation.frequency_domain.filter_order import (
     FittedModel as FittedModel, simple_weight as simple_weight,
 )
 from tdhil.estimation.frequency_domain.frequency_response import (
-    ModelCurve as ModelCurve, measure_response as measure_response,
+    ModelCurve as ModelCurve, distortion_warning as distortion_warning, measure_response as measure_response,
 )
 from tdhil.estimation.frequency_domain.inference import (
     AT_BOUND as AT_BOUND, CERTAIN as CERTAIN, contradicted as contradicted, estimate as estimate,

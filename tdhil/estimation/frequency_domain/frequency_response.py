@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from profiles import CodedText, MessageCode
 from tdhil.estimation.case import PeriodicCase, ResponseCurve
 from tdhil.estimation.frequency_domain.filter_order import FittedModel, excess_rise
 from tdhil.estimation.frequency_domain.inference import covariance, student_quantile
@@ -347,6 +348,25 @@ def _unexcited(
         return (), None
     least = min(1.0, len(found) * min(one.p_value for one in found))
     return tuple(found), _combined([float(chdtrc(freedom, statistic)), least])
+
+
+_CAUSES = frozenset((MessageCode.BACKLASH_FOUND, MessageCode.FRICTION_NOT_LINEAR, MessageCode.LOAD_SWINGS_WIDELY,
+                     MessageCode.SPEED_CHANGES_SIGN))
+
+
+def distortion_warning(response: FrequencyResponse | None, warnings: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the warning of a distortion whose cause none of the warnings names; else ()."""
+    if response is None or not response.distortion.detected or any(
+            isinstance(one, CodedText) and one.entry in _CAUSES for one in warnings):
+        return ()
+    test = response.distortion
+    beside = test.by_speed is None or (test.by_harmonics is not None and test.by_harmonics <= test.by_speed)
+    where, what = (
+        ("at unexcited harmonics", "backlash of a coupling or a gear, a torque limit, or stick-slip") if beside else
+        ("between the mean speeds", "friction or a load that changes with speed, or a limit"))
+    return (CodedText(
+        f"nonlinear distortion was detected {where} (p = {test.p_value:.1g}), and its cause was not found. Look for "
+        f"{what}", MessageCode.DISTORTION_FOUND),)
 
 
 def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tuple[int, ...]:

@@ -373,7 +373,7 @@ def _caveats(result: RigidResult, as_paper: bool, has_drill_string: bool) -> tup
             "the shaft was excited about one mean speed only. Viscous friction comes from the excited lines, not "
             "from operating points",
             MessageCode.ONE_MEAN_SPEED))
-    if not as_paper and not result.first_order:
+    if not as_paper and not result.first_order and not rejects(result.residual):
         found.append(CodedText(
             "first-order lags do not explain the reported signals. Filters of two poles and moving averages do",
             MessageCode.LAGS_NOT_FIRST_ORDER))
