@@ -190,9 +190,11 @@ def _progress(stderr: Console, text: str) -> Iterator[Callable[[str], None]]:
 
 
 def _check(namespace: argparse.Namespace) -> None:
+    from tdhil.soft_torque import SOFTNESS_RANGE
+
     check_limits(namespace, (
         ("phase_margin", 20.0, 85.0, "from 20 to 85 degrees"),
-        ("a", 0.01, 10.0, "from 0.01 to 10"),
+        ("a", *SOFTNESS_RANGE, "from {:g} to {:g}".format(*SOFTNESS_RANGE)),
         ("compensate", 0.0, 1.0, "a share from 0 to 1"),
     ))
     check_present(namespace)

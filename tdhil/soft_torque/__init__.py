@@ -18,6 +18,8 @@ if TYPE_CHECKING:
         reflection as reflection, reflection_at as reflection_at, softest_allowed as softest_allowed,
         stiff_controller as stiff_controller, tuned_controller as tuned_controller,
     )
+    from tdhil.soft_torque.candidates import SOFTNESS_RANGE as SOFTNESS_RANGE
+    from tdhil.soft_torque.crossover import MOST_GAIN_DB as MOST_GAIN_DB
     from tdhil.soft_torque.evaluation import (
         Evaluation as Evaluation, EvaluationCase as EvaluationCase, EvaluationRefused as EvaluationRefused,
         EvaluationOutcome as EvaluationOutcome, Prediction as Prediction, Trial as Trial, RigWindow as RigWindow,
@@ -82,6 +84,8 @@ else:
         "controller": "ClosedSystem DERIVATIVE_FILTER_S Margins NaturalMode SpeedController TopDrive control_law "
                       "impedance inner_lags margins reflection reflection_at softest_allowed stiff_controller "
                       "tuned_controller",
+        "candidates": "SOFTNESS_RANGE",
+        "crossover": "MOST_GAIN_DB",
         "evaluation": "Evaluation EvaluationCase EvaluationRefused EvaluationOutcome Prediction Trial RigWindow "
                       "case_of evaluate program_for check_virtual_string",
         "own_units": "DriveSetting drive_settings notch_settings one_percent_nm_s_rad",
