@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
     from tdhil.soft_torque.stability import (
         LoopMargins as LoopMargins, NO_MARGINS as NO_MARGINS, RequiredMargins as RequiredMargins,
-        is_stable as is_stable, linear_limit as linear_limit, loop_margins as loop_margins,
+        below as below, is_stable as is_stable, linear_limit as linear_limit, loop_margins as loop_margins,
     )
     from tdhil.soft_torque.uncertainty import (
         Interval as Interval, DrawnValues as DrawnValues, Truth as Truth, draw_truths as draw_truths,
@@ -90,7 +90,7 @@ else:
                       "case_of evaluate program_for check_virtual_string",
         "own_units": "DriveSetting drive_settings notch_settings one_percent_nm_s_rad",
         "roots": "RootsLost count_in roots_in",
-        "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
+        "stability": "LoopMargins NO_MARGINS RequiredMargins below is_stable linear_limit loop_margins",
         "uncertainty": "Interval DrawnValues Truth draw_truths independent_axes joint_draws",
         "simulation": "Begin Grid RPM SimulationTrace bit_jumps grid_of has_light_bit simulate",
         "critical_speed": "CriticalSpeeds HIGHEST_NOISY_RPM NOISY_RESOLUTION Search critical_speeds "

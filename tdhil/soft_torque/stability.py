@@ -85,13 +85,20 @@ class RequiredMargins:
             return ("unstable",)
         found = []
         if margins.phase_deg < self.phase_deg:
-            found.append(f"phase margin {margins.phase_deg:.0f}° (limit {self.phase_deg:.0f}°)")
+            found.append(f"phase margin {below(margins.phase_deg, self.phase_deg, 0)}° (limit {self.phase_deg:g}°)")
         if margins.gain_db < self.gain_db:
-            found.append(f"gain margin {margins.gain_db:.1f} dB (limit {self.gain_db:g} dB)")
+            found.append(f"gain margin {below(margins.gain_db, self.gain_db, 1)} dB (limit {self.gain_db:g} dB)")
         if margins.dead_time_s < self.dead_time_s:
-            found.append(f"dead-time reserve {1e3 * margins.dead_time_s:.0f} ms (limit {1e3 * self.dead_time_s:.0f} "
-                         "ms)")
+            value_ms, limit_ms = 1e3 * margins.dead_time_s, 1e3 * self.dead_time_s
+            found.append(f"dead-time reserve {below(value_ms, limit_ms, 0)} ms (limit {limit_ms:g} ms)")
         return tuple(found)
+
+
+def below(value: float, limit: float, digits: int) -> str:
+    """Return a value with at least this number of decimals, and with more if it would print as its upper limit."""
+    while digits < 6 and value < limit <= float(f"{value:.{digits}f}"):
+        digits += 1
+    return f"{value:.{digits}f}"
 
 
 USUAL_MARGINS = RequiredMargins()

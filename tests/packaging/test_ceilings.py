@@ -24,7 +24,7 @@ CEILINGS = {
     "tdhil/runner": (12_000, FIRST),
     "tdhil/service": (12_200, "0093"),
     "tdhil/session": (4_500, FIRST),
-    "tdhil/soft_torque": (6_150, "0093"),
+    "tdhil/soft_torque": (6_300, "0094"),
     "tdhil/speed_loop": (1_560, "0090"),
     "tdhil/studies": (6_100, FIRST),
     "drivers": (13_300, "0089"),

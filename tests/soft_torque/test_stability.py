@@ -14,6 +14,7 @@ from tdhil.soft_torque import (
     DrillString,
     LoopMargins,
     PipeSection,
+    RequiredMargins,
     RootsLost,
     SpeedController,
     StringFile,
@@ -23,6 +24,7 @@ from tdhil.soft_torque import (
     loop_margins,
     string_of,
 )
+from tdhil.soft_torque.candidates import gains
 from tdhil.soft_torque.controller import control_law, inner_lags
 from tdhil.soft_torque.crossover import LEAST_GAIN, highest_crossover
 from tdhil.soft_torque.roots import count_right_of
@@ -326,3 +328,42 @@ def test_few_points_of_a_fine_grid_are_computed(law, monkeypatch):
     assert sum(computed) < 0.2 * 2 * response.omega_rad_s.size
     before = len(computed)
     assert loop_margins(DRIVE, law, COLLARS, response) == first and len(computed) == before
+
+
+@pytest.mark.parametrize(("margins", "words"), [
+    ((29.7, 9.0, 0.03), "phase margin 29.7° (limit 30°)"),
+    ((29.996, 9.0, 0.03), "phase margin 29.996° (limit 30°)"),
+    ((40.0, 5.97, 0.03), "gain margin 5.97 dB (limit 6 dB)"),
+    ((40.0, 9.0, 0.0198), "dead-time reserve 19.8 ms (limit 20 ms)"),
+    ((21.4, 9.0, 0.03), "phase margin 21° (limit 30°)"),
+])
+def test_a_failed_margin_is_not_printed_as_its_limit(margins, words):
+    assert RequiredMargins().failed(LoopMargins(True, *margins, 1.0, 0.5)) == (words,)
+
+
+def test_the_order_of_entry_keeps_the_smaller_phase_margin_with_inertia_compensation():
+    """A J_c that becomes larger comes last. With J_c first, up to 29° are lost between the entries."""
+    random, lost = np.random.default_rng(1), []
+    while len(lost) < 20:
+        inertia = float(np.exp(random.uniform(np.log(300), np.log(4000))))
+        drive = TopDrive(inertia, 8.0, 60.0, DRIVE.inner_lags_s)
+
+        def margin(law, drive=drive):
+            found = loop_margins(drive, law, STRING)
+            return found.phase_deg if found.stable else 0.0
+
+        new = gains(STRING, inertia, 0.1299, float(np.exp(random.uniform(np.log(0.08), 0.0))),
+                    float(random.uniform(0.5, 1.15)), float(random.uniform(0.1, 0.6)))
+        old = gains(STRING, inertia, 0.1299, float(np.exp(random.uniform(np.log(0.02), 0.0))),
+                    float(random.uniform(0.5, 1.15)))
+        both = min(margin(new), margin(old))
+        if both < 20.0:
+            continue
+        between = replace(old, integral_nm_rad=new.integral_nm_rad)
+        if new.integral_nm_rad > old.integral_nm_rad:
+            between = replace(old, gain_nm_s_rad=new.gain_nm_s_rad)
+        last = min(margin(between), margin(replace(new, compensated_kg_m2=0.0)))
+        first = min(margin(replace(one, compensated_kg_m2=new.compensated_kg_m2)) for one in (old, between))
+        assert last >= both - 0.1
+        lost.append(both - first)
+    assert max(lost) > 8.0, "the order matters"
