@@ -190,9 +190,11 @@ def _progress(stderr: Console, text: str) -> Iterator[Callable[[str], None]]:
 
 
 def _check(namespace: argparse.Namespace) -> None:
+    from tdhil.soft_torque import SOFTNESS_RANGE
+
     check_limits(namespace, (
         ("phase_margin", 20.0, 85.0, "from 20 to 85 degrees"),
-        ("a", 0.01, 10.0, "from 0.01 to 10"),
+        ("a", *SOFTNESS_RANGE, "from {:g} to {:g}".format(*SOFTNESS_RANGE)),
         ("compensate", 0.0, 1.0, "a share from 0 to 1"),
     ))
     check_present(namespace)
@@ -600,12 +602,20 @@ def _tuned_for(
     if factor != 1.0:
         warnings.append(f"The result has a torque calibration (factor {factor:.4g}), which the drive does not know. P "
                         "and I in the table are in true N·m. " + (
-                            "The values of the drive's parameters are divided by this factor: type in these."
+                            "The values for the drive's parameters are divided by this factor: type in these."
                             if settings else "Divide P, I and J_c by this factor before you type them in."))
+        lost = sorted({one.title for every in settings.values() for one in every if one.value is None})
+        if lost:
+            warnings.append(f"{', '.join(lost)}: tdhil has no value to type in. Divide P and I of the table by "
+                            f"{factor:.4g}, then convert them to the parameter's unit by the drive's manual.")
+    if tuning.case.present is None and sources.present is not None:
+        warnings.append(f"The drive's own gains were not compared: {sources.present}. State them with --present, or "
+                        "measure them with --impedance.")
     if namespace.bit_noise is not None and (bit := tuning.case.string.bit) is not None:
         warnings.append(f"The bit noise of {bit.noise_nm:.0f} N·m rms is that of the record in "
                         f"{namespace.bit_noise.name}. It is valid for the bit, formation and weight on bit there.")
-    if not namespace.inner_lags and namespace.impedance is None:
+    assumed = not namespace.inner_lags and namespace.impedance is None
+    if assumed:
         warnings.append("The lags inside the loop are assumed. They limit the gains and how much of J can be "
                         "compensated. State them with --inner-lags.")
     if namespace.string is None and not tuning.case.inertia_draws:
@@ -624,4 +634,4 @@ def _tuned_for(
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
                     None if profile is None else profile.name, ratio, namespace.loop, sources.lags, sources.present,
                     settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED},
-                    tuple(result.get("rehearsed_faults") or ()))
+                    tuple(result.get("rehearsed_faults") or ()), assumed)

@@ -73,10 +73,12 @@ def figures_table(headings: Iterable[str], rows: Iterable[Iterable[str]], left: 
 ENTRY_ORDER = ("If I becomes smaller, type it in first; otherwise type in P first. With an integral time T_I = P/I: if "
                "it becomes longer, type it in first; otherwise type in P first. In the other order the loop may "
                "oscillate between the two entries.")
+COMPENSATION_ORDER = ("With inertia compensation: if J_c becomes smaller, type it in before P and I; if it becomes "
+                      "larger, after them.")
 
 
-def print_settings(settings: Sequence[tuple[str, str, str]], console: Console) -> None:
-    """Print parameters of the drive with the value to enter and its confidence, if any, and the order of P and I."""
+def print_settings(settings: Sequence[tuple[str, str, str]], console: Console, order: str = ENTRY_ORDER) -> None:
+    """Print parameters of the drive with the value to enter and its confidence, if any, and the order of entry."""
     if settings:
         console.print(Text("to be typed into the drive, by hand (confidence of the profile's entry)", style="bold"))
         grid = Table.grid(padding=(0, 2))
@@ -85,4 +87,4 @@ def print_settings(settings: Sequence[tuple[str, str, str]], console: Console) -
         for title, value, sure in settings:
             grid.add_row(title, f"{value} ({sure})")
         console.print(grid)
-    console.print(Text(ENTRY_ORDER))
+    console.print(Text(order))

@@ -52,10 +52,10 @@ def setting_words(setting: Part) -> str:
     return str(setting["why"]) if setting["value"] is None else f"{gain_words(setting['value'])} {setting['unit']}"
 
 
-def settings_section(settings: Sequence[tuple[str, str, str]]) -> ReportSection:
+def settings_section(settings: Sequence[tuple[str, str, str]], order: str = ENTRY_ORDER) -> ReportSection:
     """Return the drive's parameters with values and the confidence of their entries, if any; the order of P and I."""
     how = ("tdhil wrote nothing to the drive. Change one value at a time, at a low speed, with the hard-wired "
-           f"emergency stop within reach. {ENTRY_ORDER}")
+           f"emergency stop within reach. {order}")
     if not settings:
         return ReportSection("To be typed into the drive, by hand", (Text(how),))
     return ReportSection("To be typed into the drive, by hand", (

@@ -12,7 +12,14 @@ from rich.text import Text as Words
 
 from profiles.quantities import printed_interval
 from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
-from tdhil.report.console import PlainConsole, figures_table, names_and_texts, print_settings
+from tdhil.report.console import (
+    COMPENSATION_ORDER,
+    ENTRY_ORDER,
+    PlainConsole,
+    figures_table,
+    names_and_texts,
+    print_settings,
+)
 from tdhil.report.document import marks
 from tdhil.report.figure_words import meanings_section, print_meanings, words_of
 from tdhil.report.intervals import part_with_interval
@@ -30,6 +37,7 @@ from tdhil.report.schedule import (
 from tdhil.soft_torque import (
     BAND_HZ,
     HIGHEST_NOISY_RPM,
+    MOST_GAIN_DB,
     NOISY_RESOLUTION,
     RPM,
     START_DRAWS,
@@ -41,6 +49,7 @@ from tdhil.soft_torque import (
     SpeedController,
     Tuned,
     Tuning,
+    below,
     bit_jumps,
     has_light_bit,
     in_squares,
@@ -92,6 +101,8 @@ class TunedFor:
     """Values of the result at the motor shaft that a virtual string on the same rig needs."""
     rehearsed_faults: tuple[str, ...] = ()
     """Faults that were scripted in the run."""
+    lags_assumed: bool = False
+    """True: the lags in the loop are neither stated nor measured."""
 
 
 def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
@@ -172,7 +183,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             },
         },
         "required_margins": asdict(case.required),
-        "advice": _advice(tuning),
+        "advice": _advice(tuning, tuned_for),
         "warnings": warnings,
         "tdhil": __version__,
     }
@@ -198,6 +209,7 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting], shar
         "phase_margin_deg": one.margins.phase_deg, "crossover_rad_s": one.margins.crossover_rad_s,
         "least_distance_from_minus_1": one.margins.modulus,
         "lag_reserve_s": one.lag_reserve_s,
+        "integral_time_s": _number(law.integral_time_s),
         "dead_time_reserve_s": one.dead_time_reserve_s,
         "frequency_factor": one.frequency_factor,
         "margins": None if one.worst is None or one.with_string is None else {
@@ -230,25 +242,33 @@ def _quiet_part(one: Tuned, share: float) -> dict[str, float | None]:
     return {"value": value, "low": found.low, "high": found.high}
 
 
-def _advice(tuning: Tuning) -> dict[str, Any]:
+def _advice(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
     """Return the advice, as one sentence and as data."""
     advice = tuning.advice
     base = tuning.by_kind(advice.compared_with)
     best = None if advice.kind is None else tuning.by_kind(advice.kind)
     return {
         "kind": advice.kind, "compared_with": advice.compared_with, "keep": advice.keep,
-        "better_share": advice.better_share, "sentence": _sentence(tuning, base, best),
+        "better_share": advice.better_share, "less_bad": advice.less_bad,
+        "sentence": _sentence(tuning, base, best, " (for assumed lags)" if tuned_for.lags_assumed else ""),
         "thin": [] if base is None else list(base.failed),
     }
 
 
-def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
+def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None, lags: str) -> str:
+    """Return the advice. ``lags``: a remark on assumed lags, or ''."""
     assert base is not None
     what = "the present gains" if base.kind == "present" else "a stiff speed loop"
     offered = any(one.controller is not None and not one.failed for one in tuning.tuned if one is not base)
+    none = f"no other controller that tdhil tried keeps the margins{lags}"
+    less_bad = None if tuning.advice.less_bad is None else tuning.by_kind(tuning.advice.less_bad)
+    if less_bad is not None:
+        return (f"The {less_bad.kind} gains are less bad than {what}, but they do not keep the margins{lags} either: "
+                f"{', '.join(less_bad.failed)}. Compared with {what}: {_changes(tuning, base, less_bad)}. Shorten the "
+                "lags inside the loop.")
     if best is None and not offered and base.worst is not None and not base.worst.stable:
-        return (f"Do not keep {what}: they are unstable on a sampled machine. No other controller keeps the margins"
-                " either. Lower the lags inside the loop, or the required --margins.")
+        return (f"Do not keep {what}: they are unstable on a sampled machine. {none[0].upper()}{none[1:]}. Shorten the "
+                "lags inside the loop, or lower the required --margins.")
     if best is None and not tuning.advice.keep:
         why, needed = ("no bit is stated", "State bottom.coulomb_nm in string.yaml (--string) to compare them.")
         if tuning.case.string.bit is not None:
@@ -257,15 +277,15 @@ def _sentence(tuning: Tuning, base: Tuned | None, best: Tuned | None) -> str:
         soft = tuning.by_kind("soft")
         if soft is None or soft.controller is None:
             return head
-        return f"{head} Soft gains, compared with {what}: {_changes(base, soft)}."
+        return f"{head} Soft gains, compared with {what}{lags}: {_changes(tuning, base, soft)}."
     if best is None:
         head = ("Keep what you have: " if base.kind == "present" else "Keep a stiff speed loop: ")
         if not offered:
-            return head + "no other controller keeps the margins." + _thin(what, base)
+            return f"{head}{none}." + _thin(what, base)
         speed = "" if base.cure is None else f" of {_rpm_words(base.cure)}"
-        return (head + f"no other controller lowers the critical speed{speed} by more than the search resolves."
+        return (f"{head}no other controller lowers the critical speed{speed}{lags} by more than the search resolves."
                 + _thin(what, base))
-    return f"Type in the {best.kind} gains. Compared with {what}: {_changes(base, best)}."
+    return f"Type in the {best.kind} gains{lags}. Compared with {what}: {_changes(tuning, base, best)}."
 
 
 def _thin(what: str, base: Tuned) -> str:
@@ -273,7 +293,7 @@ def _thin(what: str, base: Tuned) -> str:
     return f" But {what} do not keep the margins: {', '.join(base.failed)}." if base.failed else ""
 
 
-def _changes(base: Tuned, best: Tuned) -> str:
+def _changes(tuning: Tuning, base: Tuned, best: Tuned) -> str:
     changes = []
     if base.cure is not None and best.cure is not None:
         low, high = best.cure.interval(NOISY_RESOLUTION * (best.cure.median or 0.0))
@@ -283,7 +303,9 @@ def _changes(base: Tuned, best: Tuned) -> str:
     elif base.damping is not None and best.damping is not None:
         changes.append(f"least damping {base.damping.value:.2f} → {best.damping.value:.2f}")
     if base.worst is not None and best.worst is not None:
-        changes.append(f"phase margin {_degrees(base.worst.phase_deg)} → {_degrees(best.worst.phase_deg)}")
+        limit = tuning.case.required.phase_deg
+        before, after = (_degrees(one.worst.phase_deg, limit) for one in (base, best) if one.worst is not None)
+        changes.append(f"phase margin {before} → {after}")
     return ", ".join(changes)
 
 
@@ -297,8 +319,8 @@ def _rpm_words(spread: DrawnValues, *, unit: bool = True) -> str:
     return f"{found} rpm" if unit else found
 
 
-def _degrees(value: float) -> str:
-    return f"{value:.0f}°" if math.isfinite(value) else "none needed"
+def _degrees(value: float, limit: float) -> str:
+    return f"{below(value, limit, 0)}°" if math.isfinite(value) else "none needed"
 
 
 def gains_document(law: SpeedController) -> dict[str, float]:
@@ -341,7 +363,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     for one in document["controllers"]:
         if one["refused"]:
             console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))
-    print_settings(list(_setting_rows(document)), console)
+    print_settings(list(_setting_rows(document)), console, _entry_order(document))
     console.print()
     for warning in document["warnings"]:
         console.print(Words(warning, style="yellow"))
@@ -405,9 +427,11 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
         yield "critical, rpm", [noisy_speed(one["critical_under_noise_rpm"]["cure"]) for one in taken]
         yield "  by ramp, rpm", [noisy_speed(one["critical_under_noise_rpm"]["start"]) for one in taken]
         yield "  linear, rpm", [_interval(one["linear_limit_rpm"], 0) for one in taken]
-    yield "phase margin", [_margin(one, "phase_deg", "{:.0f}°") for one in taken]
-    yield "gain margin, dB", [_margin(one, "gain_db", "{:.1f}") for one in taken]
-    yield "dead time, ms", [_margin(one, "dead_time_s", "{:.0f}", 1e3) for one in taken]
+    required = document["required_margins"]
+    yield "phase margin", [_margin(one, required, "phase_deg", 0, "°") for one in taken]
+    yield "gain margin, dB", [_margin(one, required, "gain_db", 1) for one in taken]
+    yield "dead time, ms", [_margin(one, required, "dead_time_s", 0, times=1e3) for one in taken]
+    yield "P/I, s", ["–" if one["integral_time_s"] is None else f"{one['integral_time_s']:.3g}" for one in taken]
     yield "a, φ", ["–" if one["a"] is None else f"{one['a']:.2g}, {one['frequency_factor']:.2g}" for one in taken]
     yield "J compensated", [f"{100 * one['compensated_share']:.0f} %" for one in taken]
     yield "|r|, mean", [f"{one['reflection_at_lowest_mode']['value']:.2f}, {one['mean_reflection']['value']:.2f}"
@@ -421,20 +445,19 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
                [_wrong(one["inertia_wrong_by"][k]) if one["inertia_wrong_by"] else "–" for one in taken])
 
 
-_LIMIT_OF = {"phase_deg": "phase margin", "gain_db": "gain margin", "dead_time_s": "dead-time reserve"}
-
-
-def _margin(one: Part, key: str, form: str, times: float = 1.0) -> str:
+def _margin(one: Part, required: Part, key: str, digits: int, unit: str = "", times: float = 1.0) -> str:
     """Return the least margin over the sampled true values; "!" before an insufficient one."""
     if one["margins"] is None:
         return "–"
     worst = one["margins"]["worst"]
     if not worst["stable"]:
         return "!unstable"
-    if worst[key] is None:
+    value = math.inf if worst[key] is None else worst[key]
+    if key == "gain_db" and value > MOST_GAIN_DB:
+        return f"> {MOST_GAIN_DB:g}"        # larger ones are not searched
+    if value == math.inf:
         return "no limit"
-    thin = any(words.startswith(_LIMIT_OF[key]) for words in one["margins"]["failed"])
-    return ("!" if thin else "") + form.format(times * worst[key])
+    return ("!" if value < required[key] else "") + below(times * value, times * required[key], digits) + unit
 
 
 def _speed(part: Part, document: Part) -> str:
@@ -449,6 +472,11 @@ def _wrong(part: Part) -> str:
         return "unstable"
     critical = "" if part["cure_rpm"] is None else f", {part['cure_rpm']:.0f} rpm"
     return f"{part['damping']:.2f}{critical}"
+
+
+def _entry_order(document: Part) -> str:
+    compensated = any(not one["refused"] and one["compensated_share"] for one in document["controllers"])
+    return f"{ENTRY_ORDER} {COMPENSATION_ORDER}" if compensated else ENTRY_ORDER
 
 
 def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
@@ -530,7 +558,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         )))
     if document.get("map"):
         sections.append(map_section(document["map"], document["string"]["bit"]["words"]))
-    sections.append(settings_section(list(_setting_rows(document))))
+    sections.append(settings_section(list(_setting_rows(document)), _entry_order(document)))
     if document.get("schedule"):
         sections.append(schedule_section(document["schedule"]))
     of_page = [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
@@ -558,6 +586,8 @@ def _answer(best: Part | None, document: Part) -> AnswerBox:
             headline, verdict = "No better gains were found", "the gains in place do not keep the margins"
         elif not document["advice"]["keep"]:
             headline, verdict = "No gains are recommended", "critical speeds not compared"
+        if document["advice"].get("less_bad"):
+            headline = "No gains keep the margins"
         return AnswerBox("red" if thin else "yellow", headline, lines, verdict, sentence, "")
     gains = best["at_motor"]
     remarks = [f"At the motor shaft. {best['kind'].capitalize()}: {words_of(best['kind'])}"]

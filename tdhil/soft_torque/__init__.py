@@ -18,6 +18,8 @@ if TYPE_CHECKING:
         reflection as reflection, reflection_at as reflection_at, softest_allowed as softest_allowed,
         stiff_controller as stiff_controller, tuned_controller as tuned_controller,
     )
+    from tdhil.soft_torque.candidates import SOFTNESS_RANGE as SOFTNESS_RANGE
+    from tdhil.soft_torque.crossover import MOST_GAIN_DB as MOST_GAIN_DB
     from tdhil.soft_torque.evaluation import (
         Evaluation as Evaluation, EvaluationCase as EvaluationCase, EvaluationRefused as EvaluationRefused,
         EvaluationOutcome as EvaluationOutcome, Prediction as Prediction, Trial as Trial, RigWindow as RigWindow,
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
     from tdhil.soft_torque.stability import (
         LoopMargins as LoopMargins, NO_MARGINS as NO_MARGINS, RequiredMargins as RequiredMargins,
-        is_stable as is_stable, linear_limit as linear_limit, loop_margins as loop_margins,
+        below as below, is_stable as is_stable, linear_limit as linear_limit, loop_margins as loop_margins,
     )
     from tdhil.soft_torque.uncertainty import (
         Interval as Interval, DrawnValues as DrawnValues, Truth as Truth, draw_truths as draw_truths,
@@ -82,11 +84,13 @@ else:
         "controller": "ClosedSystem DERIVATIVE_FILTER_S Margins NaturalMode SpeedController TopDrive control_law "
                       "impedance inner_lags margins reflection reflection_at softest_allowed stiff_controller "
                       "tuned_controller",
+        "candidates": "SOFTNESS_RANGE",
+        "crossover": "MOST_GAIN_DB",
         "evaluation": "Evaluation EvaluationCase EvaluationRefused EvaluationOutcome Prediction Trial RigWindow "
                       "case_of evaluate program_for check_virtual_string",
         "own_units": "DriveSetting drive_settings notch_settings one_percent_nm_s_rad",
         "roots": "RootsLost count_in roots_in",
-        "stability": "LoopMargins NO_MARGINS RequiredMargins is_stable linear_limit loop_margins",
+        "stability": "LoopMargins NO_MARGINS RequiredMargins below is_stable linear_limit loop_margins",
         "uncertainty": "Interval DrawnValues Truth draw_truths independent_axes joint_draws",
         "simulation": "Begin Grid RPM SimulationTrace bit_jumps grid_of has_light_bit simulate",
         "critical_speed": "CriticalSpeeds HIGHEST_NOISY_RPM NOISY_RESOLUTION Search critical_speeds "

@@ -26,7 +26,13 @@ from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
 from tdhil.soft_torque.stability import Reals, bit_grid, bit_impedance, chain_of, linear_limit_rad_s, steepest_slope
 from tdhil.soft_torque.uncertainty import Truth
 
+SOFTNESS_RANGE = (0.01, 10.0)
+"""Softness a that may be requested, and that the search covers."""
 SOFTNESSES = tuple(float(one) for one in np.geomspace(0.05, 2.0, 17))
+"""Softness a of most drives."""
+OUTER_SOFTNESSES = (0.01, 0.017, 0.029, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0, 10.0)
+"""Softness a of very heavy drives, and of light drives with long lags. They are tried if none of `SOFTNESSES` keeps
+the margins, or if the best ones are at an end of that range."""
 FREQUENCY_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15)
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 """Compensated shares of J."""

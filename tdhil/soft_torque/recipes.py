@@ -8,10 +8,20 @@ soft controller, broadband is refused.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from math import log
 
 import numpy as np
 
-from tdhil.soft_torque.candidates import SHARES, SOFTNESSES, Candidate, candidates, ranked_speeds
+from tdhil.soft_torque.candidates import (
+    OUTER_SOFTNESSES,
+    SHARES,
+    SOFTNESS_RANGE,
+    SOFTNESSES,
+    Candidate,
+    candidates,
+    ranked_speeds,
+)
 from tdhil.soft_torque.controller import SpeedController, softest_allowed, stiff_controller, tuned_controller
 from tdhil.soft_torque.critical_speed import longest_integral_time_s
 from tdhil.soft_torque.drill_string import MUD_DRAG_NM_S_RAD_M
@@ -30,6 +40,10 @@ SEARCH_DRAWS = 6
 """Number of truths on which candidates are ranked and finalists are simulated."""
 FINALISTS, MOST_TRIED = 5, 120
 """Number of candidates of one kind that are simulated, and the most that are checked against the margins."""
+USUAL_SOFTNESS = 0.3
+"""Softness a with which the largest stable share is searched, and that a refusal names as an example."""
+_SOFTER = (2.0, 5.0)
+"""The same for light drives with long lags, if no share is stable with the usual one."""
 _WAVES_SUPPOSED = ("the string is known as a spring only: the effect of inertia compensation on the waves of the pipe "
                    "is unknown. State the pipe in string.yaml")
 
@@ -55,18 +69,22 @@ def soft(case: TuneCase, held: Sequence[float], samples: TruthMargins) -> list[T
             f"string's lowest mode at {held[0]:.3g} Hz the drive would amplify slow oscillations",
             where=f"--a {asked:g}",
             next_step=f"Ask for less than {LAG_RESERVE * softest:.2g}, or find a shorter loop")
-    grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], (0.0,),
-                                      SOFTNESSES if asked is None else (asked,))
-            if asked is not None or one.softness <= LAG_RESERVE * softest_allowed(
-                case.string, case.drive, one.frequency_factor * held[0])]
-    kept = _within_margins(case, grid, samples)
+    kept = _searched(case, held, samples, (0.0,))
     if not kept:
-        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, asked or 0.3, held[0])
+        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, asked or USUAL_SOFTNESS, held[0])
         words = _no_margin(case, held, samples, tried)
         if asked is not None:
+            others = [one.softness for one in _searched(replace(case, softness=None), held, samples, (0.0,))]
+            advice = "No a that tdhil tried keeps the margins. Find a shorter loop"
+            if others:
+                other = min(others, key=lambda one: abs(log(one / asked)))
+                advice = (f"Ask for a {'larger' if other > asked else 'smaller'} a: {other:.2g} keeps the margins. Or "
+                          "leave --a out, or find a shorter loop")
             raise TuningRefused(f"a = {asked:g} leaves too little margin: {words}", where=f"--a {asked:g}",
-                                next_step="Ask for another a, leave --a out, or find a shorter loop")
-        return [Tuned("soft", None, f"no a keeps the margins; a = 0.3, for one: {words}", softest=softest)]
+                                next_step=advice)
+        low, high = SOFTNESS_RANGE
+        return [Tuned("soft", None, f"no a from {low:g} to {high:g} that tdhil tried keeps the margins; "
+                      f"a = {USUAL_SOFTNESS:g}, for one: {words}", softest=softest)]
     return [Tuned("soft", one.controller, softness=one.softness, frequency_factor=one.frequency_factor,
                   softest=softest) for one in kept]
 
@@ -82,8 +100,11 @@ def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) ->
         if asked:
             raise TuningRefused(_WAVES_SUPPOSED, where=f"--compensate {asked:g}", next_step="--string string.yaml")
         return [Tuned("compensated", None, _WAVES_SUPPOSED)]
-    softness = case.softness if case.softness is not None else 0.3
-    largest = largest_stable_share(case, softness, held, responses=samples.responses)
+    largest = 0.0
+    for softness in (case.softness or USUAL_SOFTNESS, *(_SOFTER if case.softness is None and asked is None else ())):
+        largest = max(largest, largest_stable_share(case, softness, held, responses=samples.responses))
+        if RESERVE * largest >= SHARES[0]:
+            break
     if asked is not None and asked > largest:
         raise TuningRefused(
             f"{100 * asked:.0f} % of J compensated is unstable if J is {_worst(case)}; at most "
@@ -91,25 +112,40 @@ def compensated(case: TuneCase, held: Sequence[float], samples: TruthMargins) ->
             where=f"--compensate {asked:g}",
             next_step=f"Ask for {RESERVE * largest:.2f} or less, narrow J's interval, or find a shorter loop")
     shares = tuple(share for share in SHARES if share <= RESERVE * largest) if asked is None else (asked,)
-    softnesses = SOFTNESSES if case.softness is None else (case.softness,)
-    grid = [one for one in candidates(case.string, case.drive.inertia_kg_m2, held[0], shares, softnesses)
-            if one.softness <= LAG_RESERVE * softest_allowed(case.string, case.drive, one.frequency_factor * held[0],
-                                                              one.share)]
-    kept = _within_margins(case, grid, samples)
+    kept = _searched(case, held, samples, shares)
     if not kept:
         share = asked if asked is not None else SHARES[0]
-        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, case.softness or 0.3, held[0], share)
+        tried = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
         words = _no_margin(case, held, samples, tried)
         if asked is not None:
             raise TuningRefused(
                 f"{100 * asked:.0f} % of J compensated leaves too little margin: {words}",
                 where=f"--compensate {asked:g}",
                 next_step="Ask for less, allow less margin with --margins, or find a shorter loop")
-        return [Tuned("compensated", None, f"no share of J keeps the margins; {100 * share:.0f} %, for one: {words}",
-                      largest_share=largest)]
+        return [Tuned("compensated", None, "no share of J that tdhil tried keeps the margins; "
+                      f"{100 * share:.0f} %, for one: {words}", largest_share=largest)]
     return [Tuned("compensated", one.controller, softness=one.softness, frequency_factor=one.frequency_factor,
                   softest=softest_allowed(case.string, case.drive, one.frequency_factor * held[0], one.share),
                   compensated_share=one.share, largest_share=largest) for one in kept]
+
+
+def _searched(
+    case: TuneCase, held: Sequence[float], samples: TruthMargins, shares: Sequence[float]
+) -> list[Candidate]:
+    """Return the best candidates with one of these shares that keep the margins: with the requested a, or with any."""
+    asked = case.softness
+
+    def kept(softnesses: Sequence[float]) -> list[Candidate]:
+        grid = candidates(case.string, case.drive.inertia_kg_m2, held[0], shares, softnesses)
+        allowed = [one for one in grid if (asked is not None and not one.share) or one.softness <= LAG_RESERVE *
+                   softest_allowed(case.string, case.drive, one.frequency_factor * held[0], one.share)]
+        return _within_margins(case, allowed, samples)
+
+    if asked is not None:
+        return kept((asked,))
+    found = kept(SOFTNESSES)
+    inside = found and all(SOFTNESSES[0] < one.softness < SOFTNESSES[-1] for one in found)
+    return found if inside else [*found, *kept(OUTER_SOFTNESSES)]
 
 
 def _within_margins(case: TuneCase, grid: Sequence[Candidate], samples: TruthMargins) -> list[Candidate]:

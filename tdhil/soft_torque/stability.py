@@ -27,13 +27,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from math import inf, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.soft_torque.controller import SpeedController, TopDrive, control_law, impedance, inner_lags
+from tdhil.soft_torque.crossover import highest_crossover
 from tdhil.soft_torque.drill_string import BitFriction, Complex, DrillString
 
 Reals = NDArray[np.float64]
@@ -52,10 +52,6 @@ COARSER, LEAST_COARSE = 8, 200
 """Ratio of the steps of two successive grids, and least number of steps of the coarsest one."""
 REFINEMENT, NEAR = 24, 1.5
 """Steps into which a step of the grid is divided, and the range |ln |L|| in which this is done."""
-LEAST_GAIN = 0.2
-"""Least |L| of interest. A smaller |L| has a gain margin above 14 dB. The grid ends above the last frequency at which
-|L| is larger."""
-
 
 @dataclass(frozen=True)
 class LoopMargins:
@@ -89,13 +85,20 @@ class RequiredMargins:
             return ("unstable",)
         found = []
         if margins.phase_deg < self.phase_deg:
-            found.append(f"phase margin {margins.phase_deg:.0f}° (limit {self.phase_deg:.0f}°)")
+            found.append(f"phase margin {below(margins.phase_deg, self.phase_deg, 0)}° (limit {self.phase_deg:g}°)")
         if margins.gain_db < self.gain_db:
-            found.append(f"gain margin {margins.gain_db:.1f} dB (limit {self.gain_db:g} dB)")
+            found.append(f"gain margin {below(margins.gain_db, self.gain_db, 1)} dB (limit {self.gain_db:g} dB)")
         if margins.dead_time_s < self.dead_time_s:
-            found.append(f"dead-time reserve {1e3 * margins.dead_time_s:.0f} ms (limit {1e3 * self.dead_time_s:.0f} "
-                         "ms)")
+            value_ms, limit_ms = 1e3 * margins.dead_time_s, 1e3 * self.dead_time_s
+            found.append(f"dead-time reserve {below(value_ms, limit_ms, 0)} ms (limit {limit_ms:g} ms)")
         return tuple(found)
+
+
+def below(value: float, limit: float, digits: int) -> str:
+    """Return a value with at least this number of decimals, and with more if it would print as its upper limit."""
+    while digits < 6 and value < limit <= float(f"{value:.{digits}f}"):
+        digits += 1
+    return f"{value:.{digits}f}"
 
 
 USUAL_MARGINS = RequiredMargins()
@@ -151,20 +154,6 @@ def _grid(string: DrillString, highest_rad_s: float) -> Reals:
     return np.concatenate([low, np.arange(10.0 * step, highest_rad_s, step)])
 
 
-@lru_cache(maxsize=1024)
-def highest_crossover(drive: TopDrive, law: SpeedController) -> float:
-    """Return the frequency, rad/s, above which |L| of the bare drive stays below half of `LEAST_GAIN`.
-
-    The string's impedance adds to that of the rotor. Near an antiresonance it may cancel a part of Jω. At these
-    frequencies it cancels at most half of it, which gives the factor of two.
-    """
-    omega = np.geomspace(0.05, 3e3, 2000)
-    s: Complex = np.asarray(1j * omega, dtype=np.complex128)
-    bare = np.abs(inner_lags(drive, s) * control_law(law, s) / (drive.inertia_kg_m2 * s))
-    above = np.flatnonzero(bare > 0.5 * LEAST_GAIN)
-    return float(omega[min(above[-1] + 1, omega.size - 1)]) if above.size else 1.0
-
-
 class StringResponses:
     """Frequency responses of strings. Each is computed once and kept: gains and J change only its range."""
 
@@ -173,7 +162,7 @@ class StringResponses:
 
     def of(self, string: DrillString, drive: TopDrive, law: SpeedController) -> StringResponse:
         """Return a response that covers all crossings of that loop."""
-        top = highest_crossover(drive, law)
+        top = highest_crossover(drive, law, string)
         known = self._known.get(string)
         if known is None or known.omega_rad_s[-1] < 0.98 * top:
             known = self._known[string] = response_of(string, 1.3 * top)
@@ -189,7 +178,7 @@ def loop_margins(
     ``response``: Z_s of that string, if it was computed before. ``stuck`` False leaves the stuck bit out. ``exact``:
     the grid is refined wherever |L| is near 1, so the reserves are exact to a fraction of a millisecond.
     """
-    top = highest_crossover(drive, law)
+    top = highest_crossover(drive, law, string)
     if response is None or response.omega_rad_s[-1] < 0.98 * top:
         response = response_of(string, top)
     least = [inf, inf, inf, inf, inf]
@@ -198,27 +187,37 @@ def loop_margins(
         points, fine = _deciding_points(drive, law, response, is_stuck, exact)
         omega = response.omega_rad_s[points]
         speed, torque = response.at_top(points, stuck=is_stuck)
-        loop = _open_loop(drive, law, omega, torque / speed)
+        over, under = _fraction(drive, law, omega, speed, torque)
+        loop = over / under
         # Nyquist criterion: rotor and string are passive, so L has no pole in the right half-plane, and the loop is
         # stable if L does not encircle −1. The phase of 1 + L begins between −180° and 0, because L has at most one
         # pole at the origin that is not balanced by losses. It ends at 0 if −1 is not encircled, otherwise at a
-        # multiple of 360°.
-        stable = stable and abs(float(np.unwrap(np.angle(1.0 + loop))[-1])) < 0.5 * pi
+        # multiple of 360°. Numerator and denominator of 1 + L are smooth, so their phases are right even if a
+        # resonance is sharper than the grid.
+        phase = np.angle(1.0 + loop[0]) + _turn(over + under) - _turn(under)
+        stable = stable and abs(float(phase)) < 0.5 * pi
         if exact:
             omega = _refined(omega, np.log(np.abs(loop)), np.searchsorted(points, fine))
-            loop = _open_loop(drive, law, omega, string.impedance_at(np.asarray(1j * omega), stuck=is_stuck))
+            over, under = _fraction(drive, law, omega, *string.at_top(np.asarray(1j * omega), stuck=is_stuck))
+            loop = over / under
         least = [min(pair) for pair in zip(least, _crossings(omega, loop), strict=True)]
     if not stable:
         return LoopMargins(False, 0.0, 0.0, 0.0, 0.0, least[4])
     return LoopMargins(True, *least)
 
 
-def _open_loop(drive: TopDrive, law: SpeedController, omega: Reals, impedance_nm_s_rad: Complex) -> Complex:
-    """Return L with this impedance of the string."""
+def _fraction(
+    drive: TopDrive, law: SpeedController, omega: Reals, speed: Complex, torque: Complex
+) -> tuple[Complex, Complex]:
+    """Return numerator and denominator of L. Both are as smooth as speed and torque at the top of the string."""
     s: Complex = np.asarray(1j * omega, dtype=np.complex128)
-    rotor = drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad
-    loop: Complex = inner_lags(drive, s) * control_law(law, s) / (rotor + impedance_nm_s_rad)
-    return loop
+    return (s * inner_lags(drive, s) * control_law(law, s) * speed,
+            s * ((drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad) * speed + torque))
+
+
+def _turn(values: Complex) -> float:
+    """Return the angle, rad, through which a smooth function turns from the first to the last point."""
+    return float(np.sum(np.angle(values[1:] * values[:-1].conj())))
 
 
 def _refined(omega: Reals, size: Reals, steps: Points) -> Reals:
@@ -252,10 +251,7 @@ def _deciding_points(
     taken[rows] = True
     nearest = inf
     while step > 1 or exact:
-        s: Complex = np.asarray(1j * omega[rows], dtype=np.complex128)
-        speed, torque = response.at_top(rows, stuck=stuck)
-        over = s * inner_lags(drive, s) * control_law(law, s) * speed
-        under = s * ((drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad) * speed + torque)
+        over, under = _fraction(drive, law, omega[rows], *response.at_top(rows, stuck=stuck))
         nearest = min(nearest, float(np.min(np.abs(1.0 + over / under), initial=inf)))
         steps = rows[:, :-1][_may_decide(over, under, nearest)]
         if step == 1:

@@ -216,6 +216,9 @@ class Advice:
     compared."""
     better_share: float | None = None
     """Share of the sampled truths on which the critical speed is not higher. None: not simulated."""
+    less_bad: str | None = None
+    """Row that fails a margin too, but is better in each than ``compared_with``, and not worse in critical speed. None:
+    there is no such row, ``compared_with`` keeps the margins, or another row is recommended."""
 
 
 @dataclass(frozen=True)

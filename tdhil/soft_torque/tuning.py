@@ -9,7 +9,8 @@ decides.
 
 **Advice.** The best row is compared with the present gains (without them: with the stiff ones), truth by truth. If it
 is not better by more than the search resolves, the advice is to keep the present gains. Without simulated critical
-speeds nothing is compared, and no row is recommended.
+speeds nothing is compared, and no row is recommended. If no row keeps the margins, and another row is better than the
+failing present gains in each of them, the advice names it as the less bad one.
 """
 
 from __future__ import annotations
@@ -156,14 +157,11 @@ def advice_of(found: Sequence[Tuned]) -> Advice:
     elif found[1].controller is not None and not found[1].failed:
         offered.append(found[1])
     unstable = base.worst is not None and not base.worst.stable
+    bad = _less_bad(found)
     if not offered:
-        return Advice(None, base.kind, keep=not unstable)
+        return Advice(None, base.kind, keep=not unstable and bad is None, less_bad=bad)
     if base.cure is None or base.controller is None:
         return Advice(None, base.kind, keep=False)
-
-    def mean(one: Tuned) -> float:
-        assert one.cure is not None
-        return float(np.mean(np.log(np.minimum(one.cure.values, 1e3))))
 
     def better_share(one: Tuned) -> float:
         assert one.cure is not None and base.cure is not None
@@ -171,19 +169,45 @@ def advice_of(found: Sequence[Tuned]) -> Advice:
         return float(sum(new <= old * (1.0 + NOISY_RESOLUTION) for new, old in pairs) / len(pairs))
 
     def helps(one: Tuned) -> bool:
-        gain = mean(base) - mean(one)
+        gain = _mean_speed(base) - _mean_speed(one)
         if base.failed:
             return bool(gain >= -NOT_BETTER_SHARE)
         return bool(gain >= log(1.0 + NOT_BETTER_SHARE)) and better_share(one) >= LEAST_BETTER_SHARE
 
-    best = min(offered, key=mean)
+    best = min(offered, key=_mean_speed)
     if not unstable and not helps(best):
-        return Advice(None, base.kind, keep=True, better_share=better_share(best))
+        return Advice(None, base.kind, keep=bad is None, better_share=better_share(best), less_bad=bad)
     # the soft controller, which every drive can run, is preferred if it is as good
     soft = next((one for one in offered if one.kind == "soft" and helps(one)), None)
-    if soft is not None and mean(soft) < mean(best) + NOT_BETTER_SHARE:
+    if soft is not None and _mean_speed(soft) < _mean_speed(best) + NOT_BETTER_SHARE:
         best = soft
     return Advice(best.kind, base.kind, keep=False, better_share=better_share(best))
+
+
+def _mean_speed(one: Tuned) -> float:
+    """Return the mean logarithm of the critical speed over the sampled truths."""
+    assert one.cure is not None
+    return float(np.mean(np.log(np.minimum(one.cure.values, 1e3))))
+
+
+def _less_bad(found: Sequence[Tuned]) -> str | None:
+    """Return the row that fails a margin, and is better in every margin than the first one, which fails too.
+
+    Its critical speed must not be higher. Without simulated speeds, only an unstable first row has a less bad one.
+    """
+    base = found[0]
+    if not base.failed or base.worst is None:
+        return None
+    better = []
+    for one in found[1:]:
+        if not one.failed or one.worst is None or not one.worst.stable:
+            continue
+        new, old = one.worst, base.worst
+        if new.phase_deg > old.phase_deg and new.gain_db > old.gain_db and new.dead_time_s > old.dead_time_s and (
+                not base.worst.stable if one.cure is None or base.cure is None
+                else _mean_speed(one) <= _mean_speed(base)):
+            better.append(one)
+    return max(better, key=lambda one: one.worst.modulus if one.worst else 0.0).kind if better else None
 
 
 def _without_noise(

@@ -23,6 +23,8 @@ from tdhil.report.operator_map import print_map
 from tdhil.report.tuning import TunedFor, print_tuning, tuning_report
 from tdhil.soft_torque import DrawnValues, Interval, Search, TuneCase, lowest_turning, tune
 from tdhil.soft_torque.simulation import LONGEST_TICK_S
+from tdhil.soft_torque.stability import LoopMargins
+from tdhil.soft_torque.tuning import advice_of
 from tests.soft_torque.cases import DRIVE, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
@@ -335,12 +337,76 @@ def test_the_first_sentence_states_missing_comparisons_and_changes(tuned):
     sentence = document["advice"]["sentence"]
     assert sentence.startswith("No gains are recommended: the critical speeds were not compared, because "
                                "--no-simulation omits them. Leave --no-simulation out to compare them. "
-                               "Soft gains, compared with the present gains: least damping")
+                               "Soft gains, compared with the present gains (for assumed lags): least damping")
     assert document["advice"]["kind"] is None and not document["advice"]["keep"]
     assert "phase margin" in sentence and "°" in sentence
     assert "onset" not in json.dumps(document)
     _, text, _ = tuned("--present", "40", "30", as_json=False)
     assert " ".join(text.split()).startswith(sentence)
+
+
+def rows_of(*margins, lags_assumed=False):
+    """Document of rows with these least margins (kind, phase, gain, dead time), simulated speeds given here."""
+    tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0), softness=0.35), None)
+    soft = tuning.by_kind("soft")
+    rows = []
+    for kind, cure_rpm, *values in margins:
+        worst = LoopMargins(True, *values, 0.1, 0.5)
+        speeds = DrawnValues((cure_rpm, cure_rpm * 1.02))
+        rows.append(replace(soft, kind=kind, worst=worst, failed=tuning.case.required.failed(worst), cure=speeds,
+                            start=speeds, linear_limit=speeds, quiet_cures=(cure_rpm,) * 5))
+    tuning = replace(tuning, tuned=tuple(rows), searched=Search(), advice=advice_of(rows))
+    return tuning_document(tuning, TunedFor("result.json", False, None, 1.0, "drive", "assumed", None,
+                                            lags_assumed=lags_assumed))
+
+
+def printed(document):
+    terminal = io.StringIO()
+    print_tuning(document, Console(file=terminal, width=300))
+    return terminal.getvalue()
+
+
+@pytest.mark.heavy
+def test_the_first_sentence_names_the_less_bad_row_and_what_it_misses():
+    document = rows_of(("present", 92.0, 6.0, 3.7, 0.006), ("stiff", 49.0, 21.0, 10.2, 0.023))
+    assert document["advice"]["less_bad"] == "stiff" and document["advice"]["kind"] is None
+    assert document["advice"]["sentence"].startswith(
+        "The stiff gains are less bad than the present gains, but they do not keep the margins either: phase margin "
+        "21° (limit 30°). Compared with the present gains: critical speed 93 → 49 rpm")
+    assert tuning_report(document, None).answer.value == "No gains keep the margins"
+    assert "Keep what you have" not in printed(document)
+
+
+@pytest.mark.heavy
+def test_the_card_has_the_time_constant_of_the_speed_and_honest_margins():
+    """A failed margin has digits until it is below its limit. A gain margin above 20 dB was not searched."""
+    document = rows_of(("present", 92.0, 29.7, 5.98, 0.0199), ("soft", 49.0, 60.0, math.inf, math.inf),
+                       lags_assumed=True)
+    card = printed(document).split("meaning of the figures")[0]
+    lines = {line[:16].strip(): line[16:].split() for line in card.splitlines()}
+    assert lines["phase margin"] == ["29.7°", "60°"]
+    assert lines["gain margin, dB"] == ["5.98", ">", "20"]
+    assert lines["dead time, ms"] == ["19.9", "no", "limit"]
+    soft = document["controllers"][1]
+    assert lines["P/I, s"][1] == f"{soft['integral_time_s']:.3g}"
+    assert soft["integral_time_s"] == pytest.approx(
+        soft["at_motor"]["gain_nm_s_rad"] / soft["at_motor"]["integral_nm_rad"])
+    assert document["advice"]["sentence"].startswith("Type in the soft gains (for assumed lags). Compared with")
+    assert "phase margin 29.7° → 60°" in document["advice"]["sentence"]
+
+
+@pytest.mark.heavy
+def test_a_gain_without_a_unit_and_gains_that_were_not_compared_are_warnings(tuned):
+    """The values of the table are in true N·m. The drive does not know the calibration."""
+    settings = {part: {"value": 1.0, "unit": "unknown", "where": "p", "confidence": "verified"}
+                for part in ("gain", "integral")}
+    code, document, _ = tuned(profile={"name": "siemens/g120"}, torque_calibration={"factor": 0.93, "rel_sd": 0.005},
+                              speed_loop_present={"settings": settings})
+    assert code == 0
+    text = " ".join(document["warnings"])
+    assert "tdhil has no value to type in. Divide P and I of the table by 0.93, then convert them" in text
+    assert "The drive's own gains were not compared: reported by the drive" in text
+    assert "type it in before P and I" in " ".join(printed(document).split())
 
 
 @pytest.mark.heavy

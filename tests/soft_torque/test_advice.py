@@ -88,6 +88,37 @@ def test_unstable_gains_are_never_kept(others, kind):
     assert (advice.kind, advice.keep) == (kind, False)
 
 
+def failing(kind, cure_rpm, phase_deg, gain_db, dead_time_s):
+    """A row with these least margins, below the required ones."""
+    worst = LoopMargins(True, phase_deg, gain_db, dead_time_s, 0.01, 0.2)
+    return replace(row(kind, cure_rpm, RequiredMargins().failed(worst)), worst=worst)
+
+
+PRESENT = failing("present", 92.0, 6.0, 3.7, 0.006)
+
+
+@pytest.mark.parametrize(("base", "stiff", "less_bad"), [
+    (PRESENT, failing("stiff", 49.0, 21.0, 10.2, 0.023), "stiff"),
+    (PRESENT, failing("stiff", 100.0, 21.0, 10.2, 0.023), None),        # a higher critical speed
+    (PRESENT, failing("stiff", 49.0, 21.0, 3.0, 0.023), None),          # a smaller gain margin
+    (replace(row("present", 92.0, ("unstable",)), worst=UNSTABLE), failing("stiff", 49.0, 21.0, 10.2, 0.023), "stiff"),
+    (replace(PRESENT, failed=()), failing("stiff", 49.0, 21.0, 10.2, 0.023), None),
+])
+def test_a_row_that_is_less_bad_in_every_margin_is_named_and_not_recommended(base, stiff, less_bad):
+    advice = advice_of((base, stiff))
+    assert (advice.kind, advice.less_bad) == (None, less_bad)
+    if less_bad:
+        assert not advice.keep
+    good = replace(row("soft", 40.0), worst=LoopMargins(True, 60.0, 9.0, 0.03, 0.1, 0.5))
+    assert advice_of((base, stiff, good)).kind == "soft" and advice_of((base, stiff, good)).less_bad is None
+
+
+def test_a_row_that_keeps_the_margins_is_not_called_less_bad():
+    good = replace(row("soft", 120.0), worst=LoopMargins(True, 60.0, 9.0, 0.03, 0.1, 0.5))
+    advice = advice_of((PRESENT, failing("stiff", 49.0, 21.0, 10.2, 0.023), good))
+    assert (advice.kind, advice.less_bad) == (None, "stiff")
+
+
 def test_a_row_that_is_better_in_some_draws_only_is_not_recommended():
     shared = row("present", 51.3)
     mixed = np.array(shared.cure.values) * np.where(np.arange(10) < 4, 1.2, 0.6)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from profiles import SpeedControllerParameters, load_profile
 from tdhil.soft_torque import (
     NO_MARGINS,
+    SOFTNESS_RANGE,
     ClosedSystem,
     Interval,
     Moved,
@@ -27,9 +31,9 @@ from tdhil.soft_torque import (
     tune,
     tuned_controller,
 )
-from tdhil.soft_torque.candidates import gains, ranked_speeds
+from tdhil.soft_torque.candidates import OUTER_SOFTNESSES, SOFTNESSES, gains, ranked_speeds
 from tdhil.soft_torque.stability import StringResponses, response_of
-from tests.soft_torque.cases import DRIVE, SOFT_025, STRING
+from tests.soft_torque.cases import DRIVE, SOFT_025, STRING, string_with
 
 pytestmark = pytest.mark.one_worker      # its fixture is expensive
 
@@ -48,7 +52,7 @@ def tuned():
 
 def test_gains_that_no_search_can_judge_are_not_offered():
     """On a very light top drive, every grid point has an integral time of more than eight periods of the string."""
-    found = {one.kind: one for one in tune(case(Interval(1.5, 1.45, 1.55)), search=None).tuned}
+    found = {one.kind: one for one in tune(case(Interval(0.15, 0.145, 0.155)), search=None).tuned}
     for kind in ("soft", "compensated"):
         assert found[kind].controller is None
         assert "integral time" in found[kind].refusal and "eight periods of the string" in found[kind].refusal
@@ -199,6 +203,43 @@ def test_softer_than_the_lags_allow_is_refused_with_its_numbers():
     with pytest.raises(TuningRefused, match=words) as caught:
         tune(case(lags=(0.40, 0.03), softness=3.0), search=None)
     assert caught.value.exit_code == 11
+
+
+def light_with_long_lags(**asked):
+    """A light drive with 153 ms of lag below 2,091 m of pipe: only a soft controller keeps the margins."""
+    string = replace(string_with(length_m=2090.7, inertia_kg_m2=451.2), bottom_viscous_nm_s_rad=34.5)
+    drive = TopDrive(43.102, 1.91266, 9.60842, (0.0259048, 0.12584, 0.00140209))
+    return TuneCase(string, drive, Interval(43.102, 41.6232, 44.5807), present=SpeedController(250.112, 361.513),
+                    **asked)
+
+
+def test_a_light_drive_with_long_lags_gets_a_larger_softness():
+    """No a up to 2 keeps the margins. The search goes on to the largest a that may be requested."""
+    own = light_with_long_lags()
+    found = {one.kind: one for one in tune(own, search=None).tuned}["soft"]
+    assert found.controller is not None and 2.0 < found.softness <= SOFTNESS_RANGE[1]
+    assert not found.failed
+    for truth in own.truths():
+        assert not own.required.failed(loop_margins(truth.drive, found.controller, truth.string, exact=True))
+
+
+def test_a_very_heavy_drive_gets_a_smaller_softness():
+    heavy = Interval(60_000.0, 58_000.0, 62_000.0)
+    found = {one.kind: one for one in tune(case(heavy), search=None).tuned}["soft"]
+    assert found.controller is not None and SOFTNESS_RANGE[0] <= found.softness < 0.05
+
+
+def test_a_refused_softness_names_the_direction_that_helps():
+    with pytest.raises(TuningRefused, match=r"a = 0\.5 leaves too little margin.*Ask for a larger a: [2-9]"):
+        tune(light_with_long_lags(softness=0.5), search=None)
+    with pytest.raises(TuningRefused, match=r"a = 5 leaves too little margin.*Ask for a smaller a: 0\.\d"):
+        tune(case(softness=5.0), search=None)
+
+
+def test_the_search_covers_what_may_be_requested():
+    every = sorted((*SOFTNESSES, *OUTER_SOFTNESSES))
+    assert (every[0], every[-1]) == SOFTNESS_RANGE
+    assert max(high / low for low, high in pairwise(every)) < 1.8
 
 
 @pytest.mark.heavy
