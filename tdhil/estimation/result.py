@@ -516,7 +516,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class PlayMotion:
-    """Whether the motion can show a play: the load crosses it where the torque on the load reverses.
+    """Ability of the motion to show a play: the load crosses it where the torque on the load reverses.
 
     ``least_torque_nm``: least torque of the drive along the rotation, by the excited lines. Below 0 the drive brakes
     the shaft, and a load with its share of inertia and friction drives the motor.

@@ -33,9 +33,9 @@ def with_lags_checked(case: Case, finding: Finding, again: Callable[[LagPrior], 
         return finding
     sources = [one.strip() for one in (stated.source or "the recording").split(";")]
     states, said = "states" if len(sources) == 1 else "state", []
-    for signal, lag_s, sd_s, seen in (
-        ("speed", stated.speed_lag_s, stated.speed_lag_sd_s, free.speed_lag_s),
-        ("torque", stated.torque_lag_s, stated.torque_lag_sd_s, free.torque_lag_s),
+    for lag_s, sd_s, seen, signal in (
+        (stated.speed_lag_s, stated.speed_lag_sd_s, free.speed_lag_s, "speed"),
+        (stated.torque_lag_s, stated.torque_lag_sd_s, free.torque_lag_s, "torque"),
     ):
         if lag_s is not None and seen is not None and _contradicts(lag_s, sd_s, seen, case.options.confidence):
             said.append(

@@ -63,8 +63,8 @@ GRAPHS = {
     "open_loop": Graph(
         "Speed loop: open loop and sensitivity",
         "wherever |L| crosses 1, its phase is not between the dashed lines",
-        "the phase is between the dashed lines where |L| crosses 1 (type in the tuned gains, or request a lower "
-        "bandwidth), or measured points lie off the curve (check the frequency response)"),
+        "the phase is between the dashed lines where |L| crosses 1 (type in the tuned gains), or measured points "
+        "lie off the curve (check the frequency response)"),
     "step": Graph(
         "Speed loop: step of the set speed",
         "the speed settles after one overshoot",
