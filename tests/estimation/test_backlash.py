@@ -48,6 +48,7 @@ def test_backlash_widens_the_interval_and_is_in_the_budget():
     assert 0.0 < line.half_width_kg_m2 < 0.01 * TRUE
 
 
+@pytest.mark.heavy
 def test_the_result_states_whether_the_motion_can_show_a_play():
     """A larger constant load keeps the torque of the drive positive. Then the load hardly crosses a play."""
     recording = recorded(0.0)[0]
@@ -62,6 +63,7 @@ def test_an_elastic_coupling_without_play_has_none():
         assert identify(recording).backlash == ()
 
 
+@pytest.mark.heavy
 def test_a_play_that_the_load_never_crosses_is_not_found():
     """The friction of the load exceeds the largest inertia torque of the motion."""
     for recording in recorded(10.0, 20.0, 50.0):
@@ -91,6 +93,7 @@ def test_lags_that_the_play_has_biased_do_not_hide_it():
         assert found.inertia is None or found.inertia.low <= TRUE <= found.inertia.high
 
 
+@pytest.mark.heavy
 def test_too_few_angles_give_no_result():
     recording = recorded(3.0)[0]
     position = recording.position_rad.copy()

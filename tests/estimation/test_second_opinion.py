@@ -80,6 +80,7 @@ def test_each_interval_covers(usual, route):
     assert half.mean() < 0.04 * TRUE
 
 
+@pytest.mark.heavy
 def test_the_lags_are_as_uncertain_at_any_confidence():
     """The half-width of a 50 % interval is not 1.96 standard uncertainties. The delay used to count as too certain."""
     recording = usual_runs()[0]

@@ -28,7 +28,7 @@ def test_the_increase_is_half_of_meier_s_for_a_weighted_mean(dof):
     assert rise_by_weights(shares_of(weights, dof)) == pytest.approx(1.0 + 2.0 * np.sum(share * (1.0 - share) / dof))
 
 
-@pytest.mark.parametrize("nu", [6.0, 10.0, 20.0])
+@pytest.mark.parametrize("nu", [6.0, *(pytest.param(one, marks=pytest.mark.heavy) for one in (10.0, 20.0))])
 def test_the_stated_variance_is_that_of_a_mean_with_estimated_weights(nu):
     """The ratio of the mean stated variance to the variance of the estimates is 1, for 20 lines of a complex signal.
 

@@ -126,7 +126,8 @@ def test_place_and_size_of_a_step():
     assert found.drift_change is None
 
 
-@pytest.mark.parametrize(("kind", "results"), [("step 1 %", 12), ("step 1 %", 20), ("step 2 %", 12)])
+@pytest.mark.parametrize(("kind", "results"), [
+    ("step 1 %", 12), *(pytest.param(*one, marks=pytest.mark.heavy) for one in (("step 1 %", 20), ("step 2 %", 12)))])
 def test_the_size_of_a_rarely_found_step_covers(kind, results):
     """Chance determines whether such a step is found. At its most probable place alone, 82 to 94 % covered."""
     rng = np.random.default_rng([3, results, round(1000 * KINDS[kind])])
@@ -175,7 +176,7 @@ STEPS = {10: 0.04, 20: -0.03}
 """Two steps in 30 results: number of the first result after each, and its size."""
 
 
-@pytest.mark.parametrize("scatter", [1.0, 0.6])
+@pytest.mark.parametrize("scatter", [1.0, pytest.param(0.6, marks=pytest.mark.heavy)])
 def test_the_sizes_of_two_steps_cover(scatter):
     """Every reported step of 200 histories counts, also where only one of the two steps was found."""
     rng = np.random.default_rng(3)

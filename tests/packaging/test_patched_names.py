@@ -78,6 +78,7 @@ def resolved(text: str) -> object:
         return getattr(resolved(holder), name, None) if holder else None
 
 
+@pytest.mark.heavy(each_share=True)
 def test_every_name_exists():
     pytest.importorskip("matplotlib")
     pytest.importorskip("starlette")

@@ -64,6 +64,7 @@ def test_scanning_writes_nothing_to_a_drive(monkeypatch):
     assert bus.only_reads
 
 
+@pytest.mark.heavy
 def test_two_nodes_and_a_starter_for_one_of_them(tmp_path):
     with EmbeddedSimulator(RigParams(), node_id=5, stepped=True) as simulated:
         bus = can.Bus(interface="virtual", channel=simulated.channel)

@@ -177,8 +177,9 @@ def test_without_an_address_it_says_that_nothing_was_sent():
     assert "tdhil stop --rig rig.yaml" in text
 
 
-@pytest.mark.parametrize("dead", ["closed Modbus port", "silent Modbus host", "closed hub", "hub that says nothing",
-                                  "no serial device"])
+@pytest.mark.parametrize("dead", [
+    "closed Modbus port", pytest.param("silent Modbus host", marks=pytest.mark.heavy), "closed hub",
+    "hub that says nothing", "no serial device"])
 @pytest.mark.parametrize("as_json", [
     pytest.param((), id="text"), pytest.param(("--json",), id="json", marks=pytest.mark.heavy),
 ])

@@ -117,7 +117,7 @@ def test_gains_with_an_error_of_30_percent_differ_and_are_named(proportional, in
     assert gain.low <= wrong.gain_nm_s_rad <= gain.high
 
 
-@pytest.mark.parametrize("to", [np.round, np.floor])
+@pytest.mark.parametrize("to", [np.round, pytest.param(np.floor, marks=pytest.mark.heavy)])
 def test_gains_are_unbiased_where_the_report_is_rounded_to_tenths_of_the_step(to):
     # Without the rounding in the model, I is 1.3 times too large: the tail below half a count is not reported.
     errors = []
@@ -129,7 +129,7 @@ def test_gains_are_unbiased_where_the_report_is_rounded_to_tenths_of_the_step(to
     assert abs(np.mean(errors)) < 0.03, errors
 
 
-@pytest.mark.parametrize("to", [np.round, np.floor])
+@pytest.mark.parametrize("to", [np.round, pytest.param(np.floor, marks=pytest.mark.heavy)])
 def test_steps_that_are_all_rounded_alike_give_no_result(to):
     for seed in range(1, 4):
         result = found(rounded(CASE.gains, 0.01, to, seed), ROUNDED)
