@@ -36,13 +36,14 @@ from tdhil.recording import Excitation, LagPrior, Recording, aborted_stage, befo
 def identify(recording: Recording, options: Options | None = None) -> Identification:
     """Identify the inertia. Never raises: it refuses. On one machine the same recording gives the same bits."""
     case = Case(before_abort(recording), options or Options(), aborted_stage(recording))
+    found_with_lags: Finding | None = None
     try:
         case = torques_compared(sampled(case))
         case = torques_judged(case)
         excitation = case.recording.excitation
         if excitation is None or not excitation.segments:
             case = recorded(case)
-            finding = identify_record(case)
+            finding = found_with_lags = identify_record(case)
             finding = with_lags_checked(case, finding, partial(_recorded_again, case))
         else:
             # the case is built step by step, so that a refusal contains the counts so far
@@ -51,10 +52,10 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
             case = periodic = clear_lines(periodic)
             finding = identify_lines(periodic)
             case, finding = without_harmonics(periodic, finding, partial(_again, bare, excitation, periodic))
-            finding = with_backlash(case, finding)
+            finding = found_with_lags = with_backlash(case, finding)
             finding = with_lags_checked(case, finding, partial(_without_lags, case, bare, excitation))
     except Refused as refused:
-        finding = Finding(refusal=refused.refusal)
+        finding = found_with_lags or Finding(refusal=refused.refusal)      # the check of the lags identifies once more
     seen = finding
     if case.sound:
         finding = cross_checked(finding, case)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from profiles.quantities import printed_interval
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.result import Estimate, Refused, doubtful, normal_quantile
+from tdhil.estimation.result import Estimate, doubtful, normal_quantile
 from tdhil.recording import LagPrior
 
 _CLEAR_SD = 3.5           # standard deviations between a stated lag and that of the data
@@ -20,15 +20,12 @@ _CLEAR_SD = 3.5           # standard deviations between a stated lag and that of
 def with_lags_checked(case: Case, finding: Finding, again: Callable[[LagPrior], Finding]) -> Finding:
     """Return the finding; if the data contradict its model because of a stated lag, with a text that names this lag.
 
-    ``again``: identifies the same samples with other knowledge of the lags, and may raise Refused.
+    ``again``: identifies the same samples with other knowledge of the lags. Raises Refused as it does.
     """
     stated = case.recording.lag_prior
     if not finding.rejected or (stated.speed_lag_s is None and stated.torque_lag_s is None):
         return finding
-    try:
-        free = again(LagPrior(skew_sd_s=stated.skew_sd_s))
-    except Refused:
-        return finding
+    free = again(LagPrior(skew_sd_s=stated.skew_sd_s))
     if free.inertia is None or doubtful(free.residual):
         return finding
     sources = [one.strip() for one in (stated.source or "the recording").split(";")]

@@ -58,7 +58,7 @@ FIGURES: Final = (
     FigureMeaning("phase margin", "further phase lag to instability, lowest of all draws", ("phase",)),
     FigureMeaning("gain margin", "factor on all gains to instability, lowest; 6 dB: 2 or 1/2"),
     FigureMeaning("dead time", "reserve: further dead time to instability, lowest"),
-    FigureMeaning("P/I, s", "integral time; if long, the speed returns this slowly after a load change"),
+    FigureMeaning("P/I, s", "integral time: a long one makes the speed return slowly"),
     FigureMeaning("a, φ", "softness, frequency factor: P = ζ/a, I = (φω)² (J − J_c)"),
     FigureMeaning("J compensated", "share of J that the speed loop compensates"),
     FigureMeaning("|r|, mean", f"reflection |r| at the lowest mode; mean, {BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz"),

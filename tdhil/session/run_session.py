@@ -194,6 +194,8 @@ class RunSession:
         """
         wanted, rehearsed = self._request.options.trace, bool(self._request.peer.faults)
         with ExitStack() as stack:
+            if rehearsed:               # loaded before motion
+                from sim_bus import read_shaft
             path = None if wanted is None else Path(wanted)
             if path is None and rehearsed:
                 path = Path(stack.enter_context(TemporaryDirectory(prefix="tdhil-"))) / "shaft.csv"
@@ -201,8 +203,6 @@ class RunSession:
                 yield path
             finally:
                 if path is not None and rehearsed and path.is_file():
-                    from sim_bus import read_shaft
-
                     self._shaft = read_shaft(path)
 
     def _identify(self) -> Identify:
