@@ -310,6 +310,7 @@ def shaft_in(result: Mapping[str, Any]) -> MeasuredShaft | None:
 def _tuned_for(
     result: Mapping[str, Any], namespace: argparse.Namespace, design: LoopDesign, profile: Profile | None
 ) -> LoopTunedFor:
+    from tdhil.estimation import unexplained_distortion
     from tdhil.report import LoopTunedFor
     from tdhil.soft_torque import SpeedController, drive_settings, notch_settings
 
@@ -328,8 +329,7 @@ def _tuned_for(
         if parameters.note:
             warnings.append(f"{profile.name}: {parameters.note}")
     distortion = (result.get("frequency_response") or {}).get("distortion") or {}
-    if distortion.get("detected") and not (
-            result.get("backlash") or result.get("harmonics") or "bent friction" in str(result.get("model"))):
+    if unexplained_distortion(bool(distortion.get("detected")), result.get("warning_codes") or ()):
         warnings.append(CodedText(
             "The frequency response shows nonlinear distortion that the result does not explain. The margins are those "
             "of a linear shaft. Look for the cause with tdhil frf, and start with half of P.",

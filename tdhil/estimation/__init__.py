@@ -8,7 +8,9 @@ from tdhil.estimation.data_checks import (
     SAMPLED_SHARE as SAMPLED_SHARE, aliased as aliased, least_samples as least_samples,
     too_few_a_period as too_few_a_period,
 )
-from tdhil.estimation.frequency_domain import torque_answer as torque_answer, with_total as with_total
+from tdhil.estimation.frequency_domain import (
+    torque_answer as torque_answer, unexplained_distortion as unexplained_distortion, with_total as with_total,
+)
 from tdhil.estimation.friction_levels import (
     Levels as Levels, measure_levels as measure_levels, tie_viscous as tie_viscous,
 )

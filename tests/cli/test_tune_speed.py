@@ -406,8 +406,8 @@ def test_distortion_without_a_known_cause_is_a_warning(tuned):
     bent = {"frequency_response": response() | {"distortion": {"detected": True}}}
     _, document, _ = tuned(**bent)
     assert "TDH-067" in document["warning_codes"]
-    for explained in ({"backlash": UNSIZED}, {"harmonics": [{}]}, {"model": "rigid+lags, bent friction"}):
-        _, document, _ = tuned(**bent, **explained)
+    for code in (MessageCode.BACKLASH_FOUND, MessageCode.FRICTION_NOT_LINEAR):
+        _, document, _ = tuned(**bent, warnings=["the cause"], warning_codes=[code.code])
         assert "TDH-067" not in document["warning_codes"]
     _, document, _ = tuned(frequency_response=response() | {"distortion": {"detected": False}})
     assert "TDH-067" not in document["warning_codes"]

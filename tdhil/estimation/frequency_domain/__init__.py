@@ -18,6 +18,7 @@ from tdhil.estimation.frequency_domain.filter_order import (
 )
 from tdhil.estimation.frequency_domain.frequency_response import (
     ModelCurve as ModelCurve, distortion_warning as distortion_warning, measure_response as measure_response,
+    unexplained_distortion as unexplained_distortion,
 )
 from tdhil.estimation.frequency_domain.inference import (
     AT_BOUND as AT_BOUND, CERTAIN as CERTAIN, contradicted as contradicted, estimate as estimate,

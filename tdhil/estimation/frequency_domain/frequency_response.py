@@ -26,6 +26,7 @@ other lines. Then Z scatters by it over the M sets of phases, and their mean has
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -350,14 +351,20 @@ def _unexcited(
     return tuple(found), _combined([float(chdtrc(freedom, statistic)), least])
 
 
-_CAUSES = frozenset((MessageCode.BACKLASH_FOUND, MessageCode.FRICTION_NOT_LINEAR, MessageCode.LOAD_SWINGS_WIDELY,
-                     MessageCode.SPEED_CHANGES_SIGN))
+_CAUSES = frozenset(one.code for one in (
+    MessageCode.BACKLASH_FOUND, MessageCode.FRICTION_NOT_LINEAR, MessageCode.LOAD_SWINGS_WIDELY,
+    MessageCode.SPEED_CHANGES_SIGN))
+
+
+def unexplained_distortion(detected: bool, warning_codes: Iterable[str]) -> bool:
+    """Return whether a distortion was detected whose cause none of the warnings names. Codes as in the result."""
+    return detected and _CAUSES.isdisjoint(warning_codes)
 
 
 def distortion_warning(response: FrequencyResponse | None, warnings: tuple[str, ...]) -> tuple[str, ...]:
     """Return the warning of a distortion whose cause none of the warnings names; else ()."""
-    if response is None or not response.distortion.detected or any(
-            isinstance(one, CodedText) and one.entry in _CAUSES for one in warnings):
+    codes = [one.entry.code for one in warnings if isinstance(one, CodedText)]
+    if response is None or not unexplained_distortion(response.distortion.detected, codes):
         return ()
     test = response.distortion
     beside = test.by_speed is None or (test.by_harmonics is not None and test.by_harmonics <= test.by_speed)
