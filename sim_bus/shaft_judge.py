@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bus.cia402 import DISABLED_BY_HOST
+from sim_bus.trace import HEADER
 
 TURNING_RAD_S = 0.2
 """Least speed of a turning shaft, rad/s. A slower one counts as at standstill."""
@@ -91,12 +92,15 @@ class TrueShaft:
         return abs(float(self.speed_rad_s[-1])) if len(self.time_s) and self.enabled[-1] else 0.0
 
 
+_COLUMNS = len(HEADER.split(","))
 _ON = {"operation enabled", "quick stop active", "fault reaction active"}
 
 
 def read_shaft(path: Path) -> TrueShaft:
-    """Return the true shaft of a complete trace."""
+    """Return the true shaft of a complete trace. Raises OSError, and ValueError for a file that is no trace."""
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").split("\n")[1:-1]]
+    if any(len(row) != _COLUMNS for row in rows):
+        raise ValueError(f"a row of {path.name} does not have {_COLUMNS} columns")
     numbers = np.array([[float(cell) for cell in row[:3]] for row in rows]).reshape(-1, 3)
     stops = [float(row[0]) for row in rows if row[4] == "state: quick stop active"]
     return TrueShaft(

@@ -11,6 +11,7 @@ every event and at least each 0.25 s of wall time, so that a reader sees a stop 
 """
 
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
@@ -18,6 +19,7 @@ from profiles import MessageCode, TdhilError
 
 HEADER = "time_s,speed_rad_s,torque_nm,state,event\n"
 ROW_PERIOD_US = 10_000
+INCOMPLETE = ".part"
 _FLUSH_S = 0.25
 
 
@@ -41,11 +43,15 @@ def check_trace_path(path: Path, where: str = "trace") -> None:
 
 
 class ShaftTrace:
-    """Writer of the trace file, which replaces an older trace. Without a path it does nothing. Raises NotATrace."""
+    """Writer of the trace file, which replaces an older trace. Without a path it does nothing. Raises NotATrace.
+
+    A full disk ends the trace, not the simulated drive. The incomplete file then has `INCOMPLETE` behind its name.
+    """
 
     def __init__(self, path: Path | None) -> None:
         if path is not None:
             check_trace_path(path)
+        self._path = path
         self._file = path.open("w", encoding="utf-8") if path is not None else None
         self._flushed_s = time.monotonic()
         if self._file is not None:
@@ -62,7 +68,10 @@ class ShaftTrace:
         if self._file is None:
             return
         text = event.replace(",", ";").replace("\n", " ")
-        self._file.write(f"{time_s:.6f},{speed_rad_s:.7g},{torque_nm:.6g},{state},{text}\n")
+        try:
+            self._file.write(f"{time_s:.6f},{speed_rad_s:.7g},{torque_nm:.6g},{state},{text}\n")
+        except OSError:
+            self._abandon()
         self.flush(now=bool(event))
 
     def flush(self, *, now: bool = False) -> None:
@@ -71,14 +80,29 @@ class ShaftTrace:
             return
         wall_s = time.monotonic()
         if now or wall_s - self._flushed_s >= _FLUSH_S:
-            self._file.flush()
+            try:
+                self._file.flush()
+            except OSError:
+                self._abandon()
             self._flushed_s = wall_s
 
     def close(self) -> None:
         """Close the file; safe to repeat."""
         if self._file is not None:
-            self._file.close()
+            try:
+                self._file.close()
+            except OSError:
+                self._abandon()
             self._file = None
+
+    def _abandon(self) -> None:
+        file, path, self._file = self._file, self._path, None
+        if file is None or path is None:
+            return
+        with suppress(OSError):
+            file.close()
+        with suppress(OSError):
+            path.replace(path.with_name(path.name + INCOMPLETE))
 
     def __enter__(self) -> Self:
         return self

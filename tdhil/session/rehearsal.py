@@ -124,7 +124,7 @@ class RehearsalVerdict(StrEnum):
 
     PASS = "pass"
     FAIL = "fail"
-    INCONCLUSIVE = "inconclusive"      # not triggered, or the operator ended the run
+    INCONCLUSIVE = "inconclusive"      # not triggered, ended by the operator, or without the shaft's motion
 
 
 _KEPT_CODES = frozenset({
@@ -205,13 +205,14 @@ def _row(fault: Scripted, kinds: Mapping[str, KnownFault]) -> int:
 def judge_rehearsal(
     peer: PeerPlan, drive: str, outcome: RunOutcome, document: Mapping[str, Any] | None = None,
     own_code: int | None = None, *, other_program: bool = False, shaft: TrueShaft | None = None,
-    speed_max_rad_s: float = math.inf,
+    untraced: str = "", speed_max_rad_s: float = math.inf,
 ) -> Rehearsal:
     """Return the verdict on the faults of this run.
 
     ``document``: the result, None if the run ended early; ``own_code``: exit code of the result; ``other_program``:
     the run has a virtual string or measures the drive's impedance; ``shaft``: motion of the simulated shaft, None
-    without a trace; ``speed_max_rad_s``: speed limit of the run.
+    without a trace; ``untraced``: reason for a missing trace, without which no rehearsal passes; ``speed_max_rad_s``:
+    speed limit of the run.
     """
     from tdhil.buses import bus_named
 
@@ -238,7 +239,8 @@ def judge_rehearsal(
     judged = tuple(
         RehearsedFault(
             one.text, row, REQUIRED.get(row, ANY_FAULT).words, REQUIRED.get(row, ANY_FAULT).codes,
-            RehearsalVerdict.INCONCLUSIVE if (by_hand and not unsafe) or one.text in peer.never_came
+            RehearsalVerdict.INCONCLUSIVE
+            if (by_hand and not unsafe) or (untraced and passed) or one.text in peer.never_came
             else RehearsalVerdict.PASS if passed else RehearsalVerdict.FAIL,
         ) for one in peer.faults for row in (_row(one, kinds),)
     )
@@ -249,6 +251,8 @@ def judge_rehearsal(
     seen = _seen(outcome, document, code, truth, covered)
     if shaft is not None and moved is not None:
         seen += _shaft_seen(shaft, moved)
+    if untraced:
+        seen += f"; the motion of the simulated shaft is not known ({untraced})"
     return Rehearsal(worst, seen + never, judged)
 
 

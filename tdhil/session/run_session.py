@@ -126,6 +126,7 @@ class RunSession:
         self._older_shown = False
         self._outcome: RunOutcome | None = None
         self._shaft: TrueShaft | None = None       # motion of the simulated shaft of a rehearsal
+        self._untraced = ""                        # reason for its absence
         self.rehearsal: Rehearsal | None = None
         """Verdict on the rehearsed faults, once the run has ended; None without faults."""
         self.log = RunLog(writer, configuration(request) | dict(request.stated))
@@ -190,7 +191,7 @@ class RunSession:
     @contextmanager
     def _traced(self) -> Iterator[Path | None]:
         """Yield the file of the simulated shaft's motion. A rehearsal has one also without --trace, and reads it at
-        the end.
+        the end. If that fails, the run goes on, and its rehearsal does not pass.
         """
         wanted, rehearsed = self._request.options.trace, bool(self._request.peer.faults)
         with ExitStack() as stack:
@@ -198,12 +199,24 @@ class RunSession:
                 from sim_bus import read_shaft
             path = None if wanted is None else Path(wanted)
             if path is None and rehearsed:
-                path = Path(stack.enter_context(TemporaryDirectory(prefix="tdhil-"))) / "shaft.csv"
+                try:
+                    folder = stack.enter_context(TemporaryDirectory(prefix="tdhil-", ignore_cleanup_errors=True))
+                    path = Path(folder) / "shaft.csv"
+                except OSError as error:
+                    self._untraced = f"no temporary folder: {error}"
             try:
                 yield path
             finally:
-                if path is not None and rehearsed and path.is_file():
-                    self._shaft = read_shaft(path)
+                if path is not None and path.is_file() and rehearsed:
+                    try:
+                        self._shaft = read_shaft(path)
+                    except (OSError, ValueError) as error:
+                        self._untraced = f"its trace cannot be read: {error}"
+                elif path is not None and not path.is_file() and self._outcome is not None:
+                    self._untraced = "its trace could not be written to the end"
+                    if wanted is not None:
+                        self._operator_interface.warn(
+                            f"tdhil: --trace {wanted}: the file could not be written to the end. Is the disk full?")
 
     def _identify(self) -> Identify:
         """Return the function that identifies the recording during the run, as `conclude` does at its end."""
@@ -241,7 +254,8 @@ class RunSession:
         bench = self.log.run.get("bench")
         self.rehearsal = judge_rehearsal(
             request.peer, request.connection.drive, outcome, document, code, other_program=bool(other),
-            shaft=self._shaft, speed_max_rad_s=math.inf if bench is None else bench["limits"]["speed_max_rad_s"])
+            shaft=self._shaft, untraced=self._untraced,
+            speed_max_rad_s=math.inf if bench is None else bench["limits"]["speed_max_rad_s"])
         with suppress(LogError):
             self.log.configure(rehearsal=self.rehearsal.plain())
 

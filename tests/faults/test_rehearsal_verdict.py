@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_bus import RigParams, TrueShaft
+from sim_bus import RigParams, TrueShaft, read_shaft
+from sim_bus.trace import HEADER
 from tdhil.buses import PeerPlan, bus_named
 from tdhil.errors import DriveFault, ExitCode, Interrupted, LimitHit, exit_code
 from tdhil.recording import Stage
@@ -15,7 +16,7 @@ from tdhil.runner import RunOutcome
 from tdhil.runner.stop import StopReport
 from tdhil.session import ANY_FAULT, REQUIRED, judge_rehearsal
 from tests.faults.rows import ROWS
-from tests.path.path_runs import tdhil
+from tests.path.path_runs import identify, tdhil
 
 STOPPED = StopReport(confirmed=True, at_rest_s=9.0, disabled=True)
 LOST = StopReport(confirmed=False, at_rest_s=None, disabled=False)
@@ -26,11 +27,11 @@ HOLDS, MISSES = (
 )
 
 
-def judged(*faults, cause=None, stop=STOPPED, document=None, code=None, never=(), shaft=None):
+def judged(*faults, cause=None, stop=STOPPED, document=None, code=None, never=(), shaft=None, untraced=""):
     bus = bus_named("canopen")
     peer = PeerPlan(True, True, 1, RigParams(), bus.parse_faults(faults), never_came=list(never))
     return judge_rehearsal(peer, "canopen", RunOutcome(STAGES, cause, stop, None), document, code, shaft=shaft,
-                           speed_max_rad_s=10.0)
+                           untraced=untraced, speed_max_rad_s=10.0)
 
 
 def shaft(speeds, *, on_until_s, disabled_s=()):
@@ -93,6 +94,36 @@ def test_a_fault_that_did_not_occur_is_no_pass_beside_one_that_did():
     rehearsal = judged("emcy@speed+1s", "sto@acquire", cause=DriveFault("7305h"), never=["sto@acquire"])
     assert [one.verdict for one in rehearsal.faults] == ["pass", "inconclusive"]
     assert rehearsal.verdict == "inconclusive" and "Not triggered: sto@acquire" in rehearsal.seen
+
+
+def test_no_rehearsal_passes_without_the_motion_of_the_simulated_shaft():
+    found = judged("sto@speed+3s", cause=DriveFault("off"), untraced="no temporary folder: disk full")
+    assert (found.verdict, found.exit_code(6)) == ("inconclusive", 6)
+    assert "the motion of the simulated shaft is not known (no temporary folder: disk full)" in found.seen
+    failed = judged("heartbeat-lost@speed", cause=LimitHit("too fast"), untraced="no temporary folder: disk full")
+    assert failed.verdict == "fail"
+
+
+@pytest.mark.heavy(but_first=1)
+@pytest.mark.parametrize(("broken", "reason"), [
+    ("tdhil.session.run_session.TemporaryDirectory", "no temporary folder"), ("sim_bus.read_shaft", "cannot be read"),
+])
+def test_a_rehearsal_goes_on_without_the_trace_of_the_shaft(no_bus_of_the_user, monkeypatch, tmp_path, broken, reason):
+    def fails(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(broken, fails)
+    done = identify(tmp_path, "--simulate", "--fault", "sto@speed+3s")
+    assert done.code == ExitCode.DRIVE_FAULT
+    found = done.document["rehearsal"]
+    assert found["verdict"] == "inconclusive" and reason in found["seen"]
+
+
+def test_a_damaged_trace_is_no_shaft(tmp_path):
+    path = tmp_path / "shaft.csv"
+    path.write_text(f"{HEADER}0.01,1.0,2.0,switched on,\n0.02,1.0\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="5 columns"):
+        read_shaft(path)
 
 
 @pytest.mark.parametrize("drive", ["canopen", "modbus"])

@@ -1,5 +1,6 @@
 """Judge of a run with false reports: each rule on traces made by hand, and the set of runs."""
 
+import errno
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from sim_bus.lying_runs import PROGRAMS, UNKNOWABLE, product, sample, standard, unknowable
 from sim_bus.reports import LIES
 from sim_bus.shaft_judge import JudgedMachine, ProcessOutcome, TrueShaft, judge, outcome_of, read_shaft
-from sim_bus.trace import HEADER, ShaftTrace
+from sim_bus.trace import HEADER, INCOMPLETE, ShaftTrace
 
 RIG = JudgedMachine(100.0, 20.0, 380.0, 10.0, string=False)
 FINE = ProcessOutcome(0, True, 20.0, "valid", 95.0, 105.0, removed=False, log_closed=True)
@@ -102,6 +103,35 @@ def test_a_shaft_is_read_from_a_trace(tmp_path):
     found = read_shaft(tmp_path / "shaft.csv")
     assert (found.disabled_s, found.stop_s, found.speed_at(2.5), found.fastest_rad_s) == ((3.0,), 2.0, 3.5, 6.0)
     assert found.enabled.tolist() == [False, True, True, False, False]
+
+
+def test_a_full_disk_ends_the_trace_only(tmp_path, monkeypatch):
+    """The simulated drive goes on; the rows before have another name, as they are no whole trace."""
+    path = tmp_path / "shaft.csv"
+    trace = ShaftTrace(path)
+    trace.row(0.0, 1.0, 2.0, "operation enabled")
+    trace.flush(now=True)
+    file = trace._file
+    monkeypatch.setattr(trace, "_file", DiskFull(file))
+    trace.row(1.0, 1.0, 2.0, "operation enabled", "an event")
+    assert not trace.active and not path.exists() and file.closed
+    assert (tmp_path / f"shaft.csv{INCOMPLETE}").read_text().count("\n") == 2
+    trace.row(2.0, 1.0, 2.0, "operation enabled")
+    trace.close()
+
+
+class DiskFull:
+    """File on a disk without space left."""
+
+    def __init__(self, file):
+        self._file = file
+
+    def write(self, text):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def close(self):
+        self._file.close()
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize(("document", "said", "expected"), [
