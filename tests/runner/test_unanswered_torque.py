@@ -14,11 +14,13 @@ from tdhil.runner.observer.unanswered_torque import (
     HELD_S,
     STRAINED_S,
     YIELD_S,
-    FlatSpeed,
+    FlatSpeedAboveString,
+    FlatSpeedWithoutString,
     HeldShaft,
     IgnoredYield,
     PointInRun,
-    TorqueAtLimit,
+    TorqueAtLimitBeyondSetpoint,
+    TorqueAtLimitNearSetpoint,
     rules,
 )
 from tests.rigs import LIMITS
@@ -45,7 +47,7 @@ def first(rule, torque_of, speed_of, until_s, command_of, *, known=True, moved=T
 
 def found(torque_of, speed_of=lambda _: 4.0, until_s=6.0, mode=Mode.TORQUE):
     """Return the time at which a flat speed is found, s."""
-    return first(FlatSpeed(STRING, STILL_RAD_S, LAG_S), torque_of, speed_of, until_s,
+    return first(FlatSpeedAboveString(STRING, STILL_RAD_S, LAG_S), torque_of, speed_of, until_s,
                  lambda time_s: Command(mode, 4.0, torque_of(time_s)))
 
 
@@ -103,7 +105,7 @@ def test_the_balance_begins_with_torque_mode():
     def command_of(time_s):
         return Command(Mode.SPEED if time_s < 1.0 else Mode.TORQUE, 4.0, torque_of(time_s))
 
-    assert first(FlatSpeed(STRING, STILL_RAD_S, LAG_S), torque_of, lambda _: 4.0, 8.0, command_of) is None
+    assert first(FlatSpeedAboveString(STRING, STILL_RAD_S, LAG_S), torque_of, lambda _: 4.0, 8.0, command_of) is None
 
 
 def test_in_speed_mode_a_speed_that_is_constant_with_the_torque_at_its_limit_is_not_controlled():
@@ -116,8 +118,7 @@ def test_in_speed_mode_a_speed_that_is_constant_with_the_torque_at_its_limit_is_
 
 def constant(kind, until_s, *, speed_rad_s, torque_nm=LIMIT_NM, setpoint_rad_s=4.0, mode=Mode.SPEED, **said):
     """Return the time at which a rule of this kind finds reports that stay the same from the first point on, s."""
-    lag_s = () if kind is HeldShaft else (LAG_S,)
-    return first(kind(STRING, STILL_RAD_S, *lag_s), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
+    return first(kind(STRING, STILL_RAD_S), lambda _: torque_nm, lambda _: speed_rad_s, until_s,
                  lambda _: Command(mode, setpoint_rad_s, torque_nm), **said)
 
 
@@ -145,7 +146,7 @@ def test_the_time_of_a_held_shaft_restarts():
 
 
 def strained(until_s=8.0, **other):
-    return constant(TorqueAtLimit, until_s, **{"speed_rad_s": 4.0, "known": False} | other)
+    return constant(TorqueAtLimitNearSetpoint, until_s, **{"speed_rad_s": 4.0, "known": False} | other)
 
 
 def test_a_speed_at_its_setpoint_needs_no_torque_at_its_limit():
@@ -162,7 +163,7 @@ def test_a_torque_at_its_limit_is_no_contradiction_without_each_of_these(other):
 
 
 def test_the_time_at_the_limit_restarts():
-    assert first(TorqueAtLimit(STRING, STILL_RAD_S, LAG_S), lambda time_s: LIMIT_NM * (time_s % 3.0 < 2.85),
+    assert first(TorqueAtLimitNearSetpoint(STRING, STILL_RAD_S), lambda time_s: LIMIT_NM * (time_s % 3.0 < 2.85),
                  lambda _: 4.0, 12.0, lambda _: Command(Mode.SPEED, 4.0, 0.0), known=False) is None
 
 
@@ -195,12 +196,20 @@ def test_only_the_last_seconds_of_a_yield_count():
 
 def at_limit_without_string(rule, speed_rad_s, torque_nm, **other):
     """Return the time at which a constant torque and speed are found while 3 rad/s are commanded, s."""
-    return first(rule(LIMITS, STILL_RAD_S, LAG_S), lambda _: torque_nm, lambda _: speed_rad_s, 6.0,
+    return first(rule, lambda _: torque_nm, lambda _: speed_rad_s, 6.0,
                  lambda _: Command(Mode.SPEED, 3.0, 0.0), **{"known": False, **other})
 
 
+def beyond():
+    return TorqueAtLimitBeyondSetpoint(LIMITS, STILL_RAD_S, LAG_S)
+
+
+def flat():
+    return FlatSpeedWithoutString(LIMITS, STILL_RAD_S)
+
+
 def test_without_a_string_torque_at_its_limit_drives_no_shaft_beyond_its_setpoint():
-    assert at_limit_without_string(TorqueAtLimit, 4.0, LIMITS.torque_nm) == pytest.approx(BEYOND_S, abs=0.11)
+    assert at_limit_without_string(beyond(), 4.0, LIMITS.torque_nm) == pytest.approx(BEYOND_S, abs=0.11)
 
 
 @pytest.mark.parametrize(("speed_rad_s", "torque_nm", "other"), [
@@ -209,18 +218,19 @@ def test_without_a_string_torque_at_its_limit_drives_no_shaft_beyond_its_setpoin
     (4.0, LIMITS.torque_nm, {"moved": False}),
 ], ids=["braking", "below", "near", "half the torque", "J known", "never moved"])
 def test_it_is_not_found_without_each_of_these(speed_rad_s, torque_nm, other):
-    assert at_limit_without_string(TorqueAtLimit, speed_rad_s, torque_nm, **other) is None
+    assert at_limit_without_string(beyond(), speed_rad_s, torque_nm, **other) is None
 
 
 def test_without_a_string_a_slow_flat_speed_counts_until_j_is_known_and_not_in_a_stop():
     """A faster one may be at the speed at which a viscous load is as large as the torque limit."""
-    assert at_limit_without_string(FlatSpeed, 0.5, LIMITS.torque_nm) == pytest.approx(FLAT_LIMIT_S, abs=0.11)
-    assert at_limit_without_string(FlatSpeed, 4.0, LIMITS.torque_nm) is None
+    assert at_limit_without_string(flat(), 0.5, LIMITS.torque_nm) == pytest.approx(FLAT_LIMIT_S, abs=0.11)
+    assert at_limit_without_string(flat(), 4.0, LIMITS.torque_nm) is None
     for other in ({"known": True}, {"stopping": True}, {"moved": False}):
-        assert at_limit_without_string(FlatSpeed, 0.5, LIMITS.torque_nm, **other) is None
+        assert at_limit_without_string(flat(), 0.5, LIMITS.torque_nm, **other) is None
 
 
-def test_the_yield_is_for_a_string_only():
-    assert {type(rule) for rule in rules(LIMITS, STILL_RAD_S, LAG_S, EVERY_S)} == {HeldShaft, TorqueAtLimit, FlatSpeed}
+def test_each_load_has_its_rules():
+    assert {type(rule) for rule in rules(LIMITS, STILL_RAD_S, LAG_S, EVERY_S)} == {
+        HeldShaft, TorqueAtLimitBeyondSetpoint, FlatSpeedWithoutString}
     assert {type(rule) for rule in rules(STRING, STILL_RAD_S, LAG_S, EVERY_S)} == {
-        HeldShaft, TorqueAtLimit, FlatSpeed, IgnoredYield}
+        HeldShaft, TorqueAtLimitNearSetpoint, FlatSpeedAboveString, IgnoredYield}

@@ -102,8 +102,8 @@ def _without_swing(
 ) -> FrictionStretch | None:
     """Return the point of a stretch at whose ends the load still oscillates; None if it is too short.
 
-    The momentum of the load is not that of J at the motor's speed. Over knots of one period it is, up to `_SWING_LEFT`
-    of what the knots change. ``short``: the point with the usual knots.
+    The momentum of the load is not that of J at the motor's speed. Knots of one period change the torque of the point;
+    `_SWING_LEFT` of this change is uncertain. ``short``: the point with the usual knots.
     """
     if span.duration_s < 2.0 * inertia.swing_s:
         return None

@@ -86,9 +86,11 @@ class UnansweredTorque(Protocol):
 
 def rules(limits: MachineLimits, still_rad_s: float, lag_s: float, point_s: float) -> tuple[UnansweredTorque, ...]:
     """Return the rules for a shaft with these limits; ``still_rad_s``: speed that counts as standstill, rad/s."""
-    always = (TorqueAtLimit(limits, still_rad_s, lag_s), FlatSpeed(limits, still_rad_s, lag_s),
-              HeldShaft(limits, still_rad_s))
-    return (*always, IgnoredYield(still_rad_s, lag_s, point_s)) if limits.has_drill_string else always
+    held = HeldShaft(limits, still_rad_s)
+    if limits.has_drill_string:
+        return (TorqueAtLimitNearSetpoint(limits, still_rad_s), FlatSpeedAboveString(limits, still_rad_s, lag_s), held,
+                IgnoredYield(still_rad_s, lag_s, point_s))
+    return (TorqueAtLimitBeyondSetpoint(limits, still_rad_s, lag_s), FlatSpeedWithoutString(limits, still_rad_s), held)
 
 
 def _strained(point: Point, limits: MachineLimits) -> bool:
@@ -119,60 +121,91 @@ class HeldShaft:
         )
 
 
-class TorqueAtLimit:
-    """Rule: speed control needs no torque at its limit there; for the time before J is known.
+class _TorqueAtLimit:
+    """Rule: speed control needs no torque at its limit there. It counts until J is known; then the balance finds it."""
 
-    Above a string the reported speed is the commanded one. Without one, it is beyond, and the torque drives it on.
-    """
+    _where: str                                     # reported speed, relative to the commanded one
 
-    def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
+    def __init__(self, limits: MachineLimits, still_rad_s: float, longest_s: float) -> None:
         self._limits = limits
-        self._still_rad_s = still_rad_s
-        self._longest_s = STRAINED_S if limits.has_drill_string else max(BEYOND_S, BEYOND_LAGS * lag_s)
+        self._least_rad_s = STANDSTILLS * still_rad_s
+        self._longest_s = longest_s
         self._strained_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
         """Evaluate one point."""
-        point, command, least = now.point, now.command, STANDSTILLS * self._still_rad_s
-        apart, near = point.speed - command.speed_rad_s, self._limits.has_drill_string
-        found = now.moved and point.speed * point.torque > 0.0 and math.copysign(1.0, point.torque) * apart > least
-        if near:
-            found = abs(apart) <= STRAINED_SHARE * self._limits.speed_max_rad_s and abs(point.speed) > least
-        found = found and command.mode is Mode.SPEED and _strained(point, self._limits) and not now.bounds.known
-        self._strained_s = self._strained_s + now.block_s if found else 0.0     # if J is known, (1) detects it
+        point, command = now.point, now.command
+        found = (command.mode is Mode.SPEED and _strained(point, self._limits) and not now.bounds.known
+                 and self._contradicts(now))
+        self._strained_s = self._strained_s + now.block_s if found else 0.0
         if self._strained_s < self._longest_s:
             return None
         return Contradiction(
             frozenset({Signal.SPEED, Signal.TORQUE}),
             f"the torque has been at its limit for {self._longest_s:g} s ({in_nm(point.torque)}) while the reported"
-            f" speed stays at {point.speed:.2f} rad/s, {'near' if near else 'beyond'} the commanded"
+            f" speed stays at {point.speed:.2f} rad/s, {self._where} the commanded"
             f" {command.speed_rad_s:.2f} rad/s",
             "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
         )
 
+    def _contradicts(self, now: PointInRun) -> bool:
+        """Return whether speed control would not need this torque at this speed."""
+        raise NotImplementedError
 
-class FlatSpeed:
-    """Rule: a reported speed stays within its noise while torque should have moved it.
 
-    The load is a torque that acted within a lag after the speed became flat. The torque of the first point alone may be
-    the end of a pulse that the speed has answered already.
-    """
+class TorqueAtLimitNearSetpoint(_TorqueAtLimit):
+    """Rule for a drill string: the torque is at its limit while the reported speed is the commanded one."""
+
+    _where = "near"
+
+    def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
+        super().__init__(limits, still_rad_s, STRAINED_S)
+
+    def _contradicts(self, now: PointInRun) -> bool:
+        speed = now.point.speed
+        near = abs(speed - now.command.speed_rad_s) <= STRAINED_SHARE * self._limits.speed_max_rad_s
+        return near and abs(speed) > self._least_rad_s
+
+
+class TorqueAtLimitBeyondSetpoint(_TorqueAtLimit):
+    """Rule without a string: torque at its limit drives a shaft on that is beyond the commanded speed already."""
+
+    _where = "beyond"
 
     def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
+        super().__init__(limits, still_rad_s, max(BEYOND_S, BEYOND_LAGS * lag_s))
+
+    def _contradicts(self, now: PointInRun) -> bool:
+        speed, torque = now.point.speed, now.point.torque
+        beyond = math.copysign(1.0, torque) * (speed - now.command.speed_rad_s)
+        return now.moved and speed * torque > 0.0 and beyond > self._least_rad_s
+
+
+class _FlatSpeed:
+    """Rule: a reported speed stays within its noise while torque should have moved it."""
+
+    def __init__(self, limits: MachineLimits, least_rad_s: float) -> None:
+        """``least_rad_s``: speed below which the rule does not count, rad/s."""
         self._limits = limits
-        self._still_rad_s = still_rad_s
-        self._lag_s = lag_s
+        self._least_rad_s = least_rad_s
         self._since_s: float | None = None
-        self._low = self._high = self._least = self._most = self._load_low = self._load_high = 0.0
-        self._impulse_nms = self._from_s = self._seen_s = 0.0
-        self._strained_s = 0.0
+        self._low = self._high = self._seen_s = self._strained_s = 0.0
 
     def see(self, now: PointInRun) -> Contradiction | None:
         """Evaluate one point."""
         point = now.point
-        for_s = self._unanswered_s(now)
-        least = (STANDSTILLS if self._limits.has_drill_string else 1.0) * self._still_rad_s     # below: `HeldShaft`
-        if for_s <= 0.0 or abs(point.speed) <= least:
+        low, high = min(self._low, point.speed), max(self._high, point.speed)
+        if self._since_s is None or high - low > 2.0 * now.noise_rad_s:
+            self._since_s = self._seen_s = point.time_s
+            self._low = self._high = point.speed
+            self._strained_s = 0.0
+            self._begin(now)
+            return None
+        took_s, self._seen_s = point.time_s - self._seen_s, point.time_s
+        self._low, self._high = low, high
+        self._strained_s = self._strained_s + took_s if _strained(point, self._limits) else 0.0
+        for_s = point.time_s - self._since_s
+        if not self._contradicts(now, for_s, took_s) or for_s <= 0.0 or abs(point.speed) <= self._least_rad_s:
             return None
         return Contradiction(
             frozenset({Signal.SPEED}),
@@ -181,52 +214,71 @@ class FlatSpeed:
             "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
         )
 
-    def _unanswered_s(self, now: PointInRun) -> float:
-        """Return the time for which the speed has not responded, s; 0: it may have responded."""
-        point, command, noise_rad_s = now.point, now.command, 2.0 * now.noise_rad_s
-        torque = command.torque_nm if command.mode is Mode.TORQUE else point.torque
-        low, high = min(self._low, point.speed), max(self._high, point.speed)
-        if self._since_s is None or high - low > noise_rad_s:
-            self._since_s = self._seen_s = point.time_s
-            self._low = self._high = point.speed
-            self._count_from(point.time_s, torque)
-            self._strained_s = 0.0
-            return 0.0
-        took_s, self._seen_s = point.time_s - self._seen_s, point.time_s
-        self._low, self._high = low, high
-        self._least, self._most = min(self._least, torque), max(self._most, torque)
-        self._strained_s = self._strained_s + took_s if _strained(point, self._limits) else 0.0
-        for_s = point.time_s - self._since_s
-        if command.mode is Mode.SPEED:
-            self._count_from(point.time_s, torque)
-            return for_s if self._strained_s >= self._limit_s(now, noise_rad_s) else 0.0
-        self._impulse_nms += took_s * torque
+    def _begin(self, now: PointInRun) -> None:
+        """Begin with the first point of a constant speed."""
+
+    def _contradicts(self, now: PointInRun, for_s: float, took_s: float) -> bool:
+        """Return whether the torque should have moved the shaft. ``took_s``: time since the point before, s."""
+        raise NotImplementedError
+
+
+class FlatSpeedAboveString(_FlatSpeed):
+    """Rule for a drill string: the change of the torque moves J and the string, or the torque is at its limit.
+
+    The load is a torque that acted within a lag after the speed became flat. The torque of the first point alone may be
+    the end of a pulse that the speed has answered already.
+    """
+
+    def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
+        super().__init__(limits, STANDSTILLS * still_rad_s)                    # below: `HeldShaft`
+        self._lag_s = lag_s
+        self._least = self._most = self._load_low = self._load_high = self._impulse_nms = self._from_s = 0.0
+
+    def _begin(self, now: PointInRun) -> None:
+        """Begin the range and the impulse of the torque anew."""
+        torque_nm = _acting(now)
+        self._from_s, self._impulse_nms = now.point.time_s, 0.0
+        self._least = self._most = self._load_low = self._load_high = torque_nm
+
+    def _contradicts(self, now: PointInRun, for_s: float, took_s: float) -> bool:
+        point, torque_nm = now.point, _acting(now)
+        if now.command.mode is Mode.SPEED:
+            self._begin(now)
+            return self._strained_s >= FLAT_LIMIT_S
+        self._least, self._most = min(self._least, torque_nm), max(self._most, torque_nm)
+        self._impulse_nms += took_s * torque_nm
         counted_s = point.time_s - self._from_s
         if counted_s <= self._lag_s:
-            self._load_low, self._load_high = min(self._load_low, torque), max(self._load_high, torque)
-        if not (self._limits.has_drill_string and now.bounds.known) or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
-            return 0.0
-        moves = FLAT_MOVES * noise_rad_s
+            self._load_low, self._load_high = min(self._load_low, torque_nm), max(self._load_high, torque_nm)
+        if not now.bounds.known or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
+            return False
         unbalanced_nms = max(
             0.0, self._impulse_nms - counted_s * self._load_high, counted_s * self._load_low - self._impulse_nms)
         by_inertia = unbalanced_nms / now.bounds.inertia_high
         by_string = (self._most - self._least) / now.bounds.string_nm_s_rad
-        return for_s if min(by_inertia, by_string) >= moves else 0.0
+        return min(by_inertia, by_string) >= FLAT_MOVES * 2.0 * now.noise_rad_s
 
-    def _limit_s(self, now: PointInRun, noise_rad_s: float) -> float:
-        """Return the time for which a torque at its limit may leave the speed within this noise, s."""
-        if self._limits.has_drill_string:
-            return FLAT_LIMIT_S
+
+class FlatSpeedWithoutString(_FlatSpeed):
+    """Rule without a string: a slow shaft that less torque moved stays flat with the torque at its limit."""
+
+    def __init__(self, limits: MachineLimits, still_rad_s: float) -> None:
+        super().__init__(limits, still_rad_s)
+
+    def _contradicts(self, now: PointInRun, for_s: float, took_s: float) -> bool:
         limits, moved_nm = self._limits, BREAKAWAY * now.bounds.breakaway_nm
-        slow = abs(now.point.speed) <= SLOW_SHARE * limits.speed_max_rad_s and not (now.stopping or now.bounds.known)
-        if not (slow and now.moved and moved_nm <= LOADED_SHARE * limits.torque_nm):
-            return math.inf            # in a stop `Runaway` has a slower rule
-        return FLAT_LIMIT_S * max(1.0, noise_rad_s / (FLAT_SHARE * self._limits.speed_max_rad_s))
+        slow = abs(now.point.speed) <= SLOW_SHARE * limits.speed_max_rad_s
+        if now.command.mode is not Mode.SPEED or not slow or now.bounds.known or not now.moved:
+            return False
+        if now.stopping or moved_nm > LOADED_SHARE * limits.torque_nm:          # in a stop `Runaway` has a slower rule
+            return False
+        coarse = 2.0 * now.noise_rad_s / (FLAT_SHARE * limits.speed_max_rad_s)
+        return self._strained_s >= FLAT_LIMIT_S * max(1.0, coarse)
 
-    def _count_from(self, time_s: float, torque_nm: float) -> None:
-        """Begin the range and the impulse of the torque anew."""
-        self._from_s, self._impulse_nms = time_s, 0.0
-        self._least = self._most = self._load_low = self._load_high = torque_nm
+
+def _acting(now: PointInRun) -> float:
+    """Return the torque on the shaft, N·m: in torque mode the commanded one, which no report can falsify."""
+    return now.command.torque_nm if now.command.mode is Mode.TORQUE else now.point.torque
 
 
 class IgnoredYield:
