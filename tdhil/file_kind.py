@@ -36,13 +36,14 @@ def kind_of(path: Path) -> str:
     return YAML if path.suffix.lower() in (".yaml", ".yml") else ""
 
 
-def require_log_kind(path: Path, command: str, *, trace: bool = False) -> None:
+def require_log_kind(path: Path, instead: str, *, trace: bool = False) -> None:
     """Raise UsageError if the file is of a kind that is neither a log nor a trace.
 
-    ``command``: in the next step. ``trace``: any other text may be a trace; otherwise only one that ends in .csv.
+    ``instead``: what to give, for the next step. ``trace``: any other text may be a trace; otherwise only one that ends
+    in .csv.
     """
     kind = kind_of(path)
     if kind == LOG or (not kind and (trace or path.suffix.lower() == ".csv")):
         return
     raise UsageError(f"is {kind}, not a log" if kind else "is not a log of tdhil (MCAP), and does not end in .csv",
-                     where=str(path), next_step=f"Give the log: {command}", entry=MessageCode.WRONG_KIND_OF_FILE)
+                     where=str(path), next_step=f"Give the log: {instead}", entry=MessageCode.WRONG_KIND_OF_FILE)

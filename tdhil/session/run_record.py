@@ -171,7 +171,7 @@ def read(
                 raise UsageError("is for a trace in CSV; this log contains its own", where=name,
                                  entry=MessageCode.OPTION_FOR_CSV_ONLY)
         return _read_log(path)
-    require_log_kind(path, "tdhil replay run.mcap", trace=True)
+    require_log_kind(path, "run.mcap", trace=True)
     from tdhil.config import ASKED_AGAIN
     from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
     from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD

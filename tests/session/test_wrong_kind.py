@@ -11,7 +11,7 @@ from tdhil.session import read
 RESULT = b'{"verdict": "valid", "tdhil": "1.0"}'
 MCAP = b"\x89MCAP0\r\n" + bytes(300_000)
 KINDS = [
-    ("result.json", RESULT, "is a result of tdhil, not a log. Give the log: tdhil replay run.mcap"),
+    ("result.json", RESULT, "is a result of tdhil, not a log. Give the log: run.mcap"),
     ("other.json", b'{"a": 1}', "is a JSON file, not a log"),
     ("rig.yaml", b"# not verified, in this profile; a, b\nname: bench\n", "is a YAML file, not a log"),
     ("first.html", b"\xef\xbb\xbf <!DOCTYPE html>\na { b: c, d }", "is an HTML page, not a log"),
