@@ -85,15 +85,20 @@ def test_a_terminal_that_takes_nothing_holds_no_cycle_up(monkeypatch):
             confirm_speed(1.0, "", idle, console=Console(file=stuck), pause_display=lambda: None)
     finally:
         taken.set()
+        for thread in threading.enumerate():       # it still reads sys.stdin, which is that of the next test then
+            if thread.name == "prompt":
+                thread.join()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such terminals there")
 def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
     operator, terminal = os.openpty()
-    shown, answered = io.StringIO(), []
+    shown, answered, cycles = io.StringIO(), [], []
 
     def idle():
         time.sleep(0.001)
+        cycles.append(1)
+        assert len(cycles) < 60_000, "the answer was not received"
         if "yes and Enter" in shown.getvalue() and not answered:    # after the question
             answered.append(os.write(operator, b"no\n"))
 
