@@ -132,6 +132,7 @@ def test_the_abort_of_a_run_is_stated(log, lines, capsys):
     assert "TDH-030" in said
 
 
+@pytest.mark.heavy
 def test_a_trace_and_a_log_are_read_together(trace, log, capsys):
     assert main(["frf", *trace, "--json"]) == 0
     (alone,) = json.loads(capsys.readouterr().out)["responses"]

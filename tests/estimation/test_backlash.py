@@ -58,6 +58,7 @@ def test_the_result_states_whether_the_motion_can_show_a_play():
         reversing.backlash_motion.least_torque_nm + 100.0, abs=0.1)
 
 
+@pytest.mark.heavy
 def test_an_elastic_coupling_without_play_has_none():
     for recording in recorded(0.0):
         assert identify(recording).backlash == ()

@@ -110,6 +110,7 @@ def test_torque_scale_widens_only_the_total(one_recording):
     assert "torque scale exact" in found.conditional_on
 
 
+@pytest.mark.heavy
 def test_papers_model_is_rejected_with_lags(one_recording):
     found = identify(one_recording, Options(model="paper"))
     assert found.verdict is Verdict.MODEL_REJECTED

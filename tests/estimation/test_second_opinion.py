@@ -126,6 +126,7 @@ def test_without_excited_segments_the_rows_give_the_scatter(runs):
     assert covered >= binom.ppf(0.005, runs, 0.95)
 
 
+@pytest.mark.heavy
 def test_a_result_that_is_wrong_is_contradicted():
     recording = ten_runs()[0]
     wrong = result(1.15 * TRUE)

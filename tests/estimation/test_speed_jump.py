@@ -34,6 +34,7 @@ def rescaled(recording, factor, lag_s=LAG_S):
     return replace(recording, speed_rad_s=share * recording.speed_rad_s)
 
 
+@pytest.mark.heavy
 def test_a_healthy_run_is_far_below_the_bound(recorded):
     for share in (1.0, 0.8):
         assert jump_contradiction(recorded, share * PLANT.motor, PLANT.motor) is None

@@ -10,7 +10,7 @@ from tdhil.recording.recording import LagPrior
 OBJECT = "object 0x2250"
 
 
-@pytest.mark.heavy(but_first=1)
+@pytest.mark.heavy
 @pytest.mark.parametrize(("prior", "said"), [
     (LagPrior(0.20, 0.01, source="rig.yaml"), "rig.yaml states a lag of the reported speed of 0.2 s ± 0.01 s"),
     (LagPrior(0.40, 0.01, 0.05, 0.005, OBJECT), f"{OBJECT} states a lag of the reported torque of 0.05 s ± 0.005 s"),

@@ -27,6 +27,7 @@ def logs(few, tmp_path_factory):
     return folder
 
 
+@pytest.mark.heavy
 def test_a_fleet_leaves_rehearsals_out_and_counts_them(logs, tmp_path, capsys):
     out = tmp_path / "fleet.csv"
     command = ["fleet", str(logs), "--out", str(out), "--jobs", "1"]
@@ -43,6 +44,7 @@ def test_a_fleet_leaves_rehearsals_out_and_counts_them(logs, tmp_path, capsys):
     assert [row.rehearsed_faults for row in read_table(out)] == [FAULT, None]
 
 
+@pytest.mark.heavy
 def test_watch_marks_a_rehearsal(logs, tmp_path, capsys):
     command = ["watch", str(logs), "--once", "--out", str(tmp_path / "fleet.csv"), "--jobs", "1"]
     assert main(command) == 0
@@ -65,6 +67,7 @@ def test_a_rehearsal_without_a_result_is_no_failed_log_of_a_fleet(logs, tmp_path
     assert (found.rows, found.rehearsals, found.exit_code) == ((), 1, 0)
 
 
+@pytest.mark.heavy
 def test_compare_refuses_a_rehearsal_by_name_and_marks_it(logs, tmp_path, capsys):
     both = [str(logs / "run.mcap"), str(logs / "rehearsal.mcap")]
     assert main(["compare", *both]) == 2

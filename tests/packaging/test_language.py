@@ -36,6 +36,7 @@ def test_no_room_gets_less_plain(counts):
     assert above == {}
 
 
+@pytest.mark.heavy(each_share=True)
 @pytest.mark.parametrize("room", ["tdhil", "drivers", "sim_bus", "profiles"])
 def test_a_percentage_has_a_space_before_its_sign(room):
     """The SI brochure (5.4.7) requires it. The format ``{share:.1%}`` prints no space; ``{100 * share:.1f} %`` does."""

@@ -48,6 +48,7 @@ BUSES = [
 ]
 
 
+@pytest.mark.heavy(but_first=1)
 @pytest.mark.parametrize("generic", BUSES)
 def test_friction_stops_the_shaft_before_the_drive_is_disabled(tmp_path, generic):
     shaft = stopped(tmp_path, generic, *QUICK, "--periods", 3)

@@ -102,6 +102,7 @@ def test_a_dry_run_is_readable_in_80_columns(monkeypatch):
         assert wanted in done.out
 
 
+@pytest.mark.heavy
 def test_a_plan_ends_before_the_time_limit_or_is_refused(tmp_path):
     """A run used to turn the shaft through stages 1 to 4 first, and the guard then ended stage 5."""
     short, shorter = (rig_file(tmp_path, limits_text(time_s=time_s), name=f"{time_s}.yaml") for time_s in (300.0, 75.0))

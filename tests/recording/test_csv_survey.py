@@ -81,6 +81,7 @@ NAMES = st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\r\n")
 any_choice = given(names=NAMES, items=st.lists(st.text(max_size=20), max_size=5))
 
 
+@pytest.mark.heavy
 @settings(max_examples=10, deadline=None)
 @any_choice
 def test_no_choice_raises_and_a_right_one_has_no_error(names, items):

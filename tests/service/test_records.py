@@ -87,6 +87,7 @@ def test_an_invalid_tag_is_refused(given):
         tags_of(given)
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize(("number", "status"), [(errno.ENOSPC, 507), (errno.EDQUOT, 507), (errno.EACCES, 503)])
 def test_without_an_audit_entry_nothing_is_changed(call, service, monkeypatch, number, status):
     run = ended(call, service)
@@ -207,6 +208,7 @@ def test_a_person_signs_the_verdict_and_the_log_once_and_the_audit_has_it(call, 
     assert "the log is not the signed one" in call("GET", f"/runs/{run}/acceptance", 200)["problem"]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("change", "words"), [
     ({"verdict": "pass"}, "its verdict is pass, and the verdict of the acceptance is fail"),
     ({"name": "B. Manager"}, "differs from its entry in the audit: name"),

@@ -58,6 +58,7 @@ def filled(tmp_path) -> tuple[Index, list[Summary]]:
     return index, found
 
 
+@pytest.mark.heavy(but_first=3)
 @pytest.mark.parametrize("wanted", FILTERS)
 def test_the_index_applies_filter_and_order(filled, wanted):
     index, every = filled
@@ -123,6 +124,7 @@ def many(service, monkeypatch):
     return [ahead.get(one.id, one) for one in found]
 
 
+@pytest.mark.heavy(but_first=2)
 @pytest.mark.parametrize("query", [
     "", "sort=inertia_kg_m2&order=asc", "sort=note&order=desc", "sort=verdict&order=asc&archived=true",
     "rig=a", "verdict=valid&sort=rig&order=asc", "tag=bearing&text=anna", "text=live&sort=state",

@@ -382,6 +382,7 @@ def a_head_without_its_seal(audit: Audit) -> None:
     write_json(path, {**json.loads(path.read_bytes()), "mac": "0" * 64})
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("attack", [
     cut_off_with_a_new_head, cut_off_with_an_old_head, one_more_line_without_a_head, one_more_line_with_a_head,
     all_of_it_deleted, the_key_deleted, the_key_another, an_old_head_alone, a_head_without_its_seal,

@@ -213,6 +213,7 @@ def light_with_long_lags(**asked):
                     **asked)
 
 
+@pytest.mark.heavy
 def test_a_light_drive_with_long_lags_gets_a_larger_softness():
     """No a up to 2 keeps the margins. The search goes on to the largest a that may be requested."""
     own = light_with_long_lags()
@@ -223,12 +224,14 @@ def test_a_light_drive_with_long_lags_gets_a_larger_softness():
         assert not own.required.failed(loop_margins(truth.drive, found.controller, truth.string, exact=True))
 
 
+@pytest.mark.heavy
 def test_a_very_heavy_drive_gets_a_smaller_softness():
     heavy = Interval(60_000.0, 58_000.0, 62_000.0)
     found = {one.kind: one for one in tune(case(heavy), search=None).tuned}["soft"]
     assert found.controller is not None and SOFTNESS_RANGE[0] <= found.softness < 0.05
 
 
+@pytest.mark.heavy
 def test_a_refused_softness_names_the_direction_that_helps():
     with pytest.raises(TuningRefused, match=r"a = 0\.5 leaves too little margin.*Ask for a larger a: [2-9]"):
         tune(light_with_long_lags(softness=0.5), search=None)

@@ -137,6 +137,7 @@ def test_steps_that_are_all_rounded_alike_give_no_result(to):
     assert "rounded alike" in result.reason or "30 %" in result.reason
 
 
+@pytest.mark.heavy
 def test_slow_noise_is_weighted_by_its_spectrum():
     """Noise of 0.5 s correlation time: with equal weights of all samples, the intervals of I are 1.5 times as wide."""
     widths = []
@@ -233,6 +234,7 @@ def test_no_number_of_pairs_helps_where_a_limit_acted():
     assert found(responses(CASE.gains, noise=NOISY), limited=True).needed_pairs is None
 
 
+@pytest.mark.heavy
 def test_a_record_gives_the_pairs_of_its_whole_steps():
     program = replace(PROGRAM, pairs=9)
     time_s = PERIOD_S * np.arange(round(program.duration_s / PERIOD_S) + 1)
