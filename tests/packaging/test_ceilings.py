@@ -21,7 +21,7 @@ CEILINGS = {
     "tdhil/fleet": (2_200, "0089"),
     "tdhil/recording": (5_400, FIRST),
     "tdhil/report": (7_150, "0097"),
-    "tdhil/runner": (12_100, "0094"),
+    "tdhil/runner": (12_150, "0098"),
     "tdhil/service": (12_200, "0093"),
     "tdhil/session": (4_500, FIRST),
     "tdhil/soft_torque": (6_300, "0097"),

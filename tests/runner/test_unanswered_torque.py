@@ -13,6 +13,7 @@ from tdhil.runner.observer.unanswered_torque import (
     FLAT_LIMIT_S,
     HELD_S,
     STRAINED_S,
+    VARIED_S,
     YIELD_S,
     FlatSpeedAboveString,
     FlatSpeedWithoutString,
@@ -106,6 +107,20 @@ def test_the_balance_begins_with_torque_mode():
         return Command(Mode.SPEED if time_s < 1.0 else Mode.TORQUE, 4.0, torque_of(time_s))
 
     assert first(FlatSpeedAboveString(STRING, STILL_RAD_S, LAG_S), torque_of, lambda _: 4.0, 8.0, command_of) is None
+
+
+def multisine_nm(time_s):
+    """Return a torque whose first second already has its whole range: no impulse leaves the loads that it allows."""
+    return HOLDING_NM + 200.0 * math.cos(2.0 * math.pi * 0.5 * time_s) + 200.0 * math.cos(2.0 * math.pi * time_s)
+
+
+def test_a_speed_that_does_not_follow_a_multisine_is_found():
+    """`lying_reports.py` 795: the sensor froze in a multisine. The shaft reached 15 rad/s, and its limit is 10."""
+    noticed_s = found(multisine_nm, until_s=30.0)
+    assert VARIED_S < noticed_s < 3.0 * VARIED_S
+    # a small part of it is within the noise, and a speed that follows it is none that stays
+    assert found(lambda time_s: HOLDING_NM + 0.05 * (multisine_nm(time_s) - HOLDING_NM), until_s=30.0) is None
+    assert found(multisine_nm, lambda time_s: 4.0 + 0.3 * math.sin(2.0 * math.pi * 0.5 * time_s), 30.0) is None
 
 
 def test_in_speed_mode_a_speed_that_is_constant_with_the_torque_at_its_limit_is_not_controlled():

@@ -11,6 +11,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from drivers import Command, Mode
 from profiles.quantities import in_nm
 from tdhil.runner.observer.contradiction import Contradiction, Signal
@@ -41,6 +43,14 @@ friction at low speed may exceed it, the load may be as large as the limit."""
 FLAT_MOVES = 12.0
 """Least expected change of the speed, as a multiple of its noise, by the bounds of J and of the string's impedance.
 An oscillating string keeps a healthy speed within its noise up to 5.6 times that (`benchmarks/healthy_runs.py`)."""
+
+VARIED_S, VARIED_MOVES = 5.0, 6.0
+"""Least time of a constant speed above a string, s, in which the torque varies about a constant load. Second value:
+least range of the speed that this variation gives J and the string's impedance, as a multiple of the noise.
+
+It is for a torque that goes up and down as a multisine does, whose impulse never leaves the range of possible loads. No
+load varies as the commanded torque does for so long. Healthy speeds did not stay within their noise for this time
+(decision 0098)."""
 
 BEYOND_S, BEYOND_LAGS = 1.0, 2.0   # s, lags: longest time for which torque drives a shaft beyond its setpoint
 
@@ -223,22 +233,25 @@ class _FlatSpeed:
 
 
 class FlatSpeedAboveString(_FlatSpeed):
-    """Rule for a drill string: the change of the torque moves J and the string, or the torque is at its limit.
+    """Rule for a drill string: the torque moves J and the string, for each load that is possible, or is at its limit.
 
-    The load is a torque that acted within a lag after the speed became flat. The torque of the first point alone may be
-    the end of a pulse that the speed has answered already.
+    For a torque that rises or falls, the load is a torque that acted within a lag after the speed became flat. The
+    torque of the first point alone may be the end of a pulse that the speed has answered already. For a torque that
+    goes up and down, the load is constant (`VARIED_S`).
     """
 
     def __init__(self, limits: MachineLimits, still_rad_s: float, lag_s: float) -> None:
         super().__init__(limits, STANDSTILLS * still_rad_s)                    # below: `HeldShaft`
         self._lag_s = lag_s
         self._least = self._most = self._load_low = self._load_high = self._impulse_nms = self._from_s = 0.0
+        self._varied = _ConstantLoad(0.0, lag_s)
 
     def _begin(self, now: PointInRun) -> None:
         """Begin the range and the impulse of the torque anew."""
         torque_nm = _acting(now)
         self._from_s, self._impulse_nms = now.point.time_s, 0.0
         self._least = self._most = self._load_low = self._load_high = torque_nm
+        self._varied = _ConstantLoad(torque_nm, self._lag_s)
 
     def _contradicts(self, now: PointInRun, for_s: float, took_s: float) -> bool:
         point, torque_nm = now.point, _acting(now)
@@ -248,15 +261,50 @@ class FlatSpeedAboveString(_FlatSpeed):
         self._least, self._most = min(self._least, torque_nm), max(self._most, torque_nm)
         self._impulse_nms += took_s * torque_nm
         counted_s = point.time_s - self._from_s
+        self._varied.add(took_s, torque_nm, counted=counted_s > FLAT_LAGS * self._lag_s)
         if counted_s <= self._lag_s:
             self._load_low, self._load_high = min(self._load_low, torque_nm), max(self._load_high, torque_nm)
         if not now.bounds.known or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
             return False
+        inertia, string = now.bounds.inertia_high, now.bounds.string_nm_s_rad
         unbalanced_nms = max(
             0.0, self._impulse_nms - counted_s * self._load_high, counted_s * self._load_low - self._impulse_nms)
-        by_inertia = unbalanced_nms / now.bounds.inertia_high
-        by_string = (self._most - self._least) / now.bounds.string_nm_s_rad
-        return min(by_inertia, by_string) >= FLAT_MOVES * 2.0 * now.noise_rad_s
+        moves = min(unbalanced_nms / inertia, (self._most - self._least) / string)
+        varied = self._varied.range_rad_s(inertia, string) if self._varied.time_s >= VARIED_S else 0.0
+        noise_rad_s = 2.0 * now.noise_rad_s
+        return moves >= FLAT_MOVES * noise_rad_s or varied >= VARIED_MOVES * noise_rad_s
+
+
+class _ConstantLoad:
+    """Range of the reported speed of a shaft with a constant load, from the torque. Sums weighted by time."""
+
+    # J ω' = T − L − ζ ω with a constant load L. Without the string J ω is ∫T dt less a straight line, so that the
+    # deviation of ∫T dt from its best line is the least change that any L allows. Without J, ω is (T − L)/ζ. The
+    # smaller range counts. T passes the filter of the reported speed first. A range is that of a sine with this rms.
+    _RANGE_PER_RMS = 2.0 * math.sqrt(2.0)
+
+    def __init__(self, torque_nm: float, lag_s: float) -> None:
+        self._lag_s = lag_s
+        self._filtered_nm = torque_nm
+        self._impulse_nms = self.time_s = 0.0
+        self._products = np.zeros((4, 4))                  # of 1, time, impulse, torque
+
+    def add(self, took_s: float, torque_nm: float, *, counted: bool) -> None:
+        """Add the torque that acted for ``took_s``. ``counted``: the filter has forgotten the torque before."""
+        self._filtered_nm += took_s / (took_s + self._lag_s) * (torque_nm - self._filtered_nm)
+        if counted:
+            self._impulse_nms += took_s * self._filtered_nm
+            self.time_s += took_s
+            row = np.array((1.0, self.time_s, self._impulse_nms, self._filtered_nm))
+            self._products += took_s * np.outer(row, row)
+
+    def range_rad_s(self, inertia_kg_m2: float, string_nm_s_rad: float) -> float:
+        """Return the least range of the speed, rad/s. At least two points are counted."""
+        means = self._products / self.time_s
+        (time2, by_time, _), (_, impulse2, _), (_, _, torque2) = means[1:, 1:] - np.outer(means[0, 1:], means[0, 1:])
+        deviation_nms = math.sqrt(max(0.0, impulse2 - by_time * by_time / time2))
+        return self._RANGE_PER_RMS * min(
+            deviation_nms / inertia_kg_m2, math.sqrt(max(0.0, torque2)) / string_nm_s_rad)
 
 
 class FlatSpeedWithoutString(_FlatSpeed):
