@@ -47,6 +47,7 @@ MODE_SPECIFIC = 0x1000
 
 
 DISABLED_BY_HOST = "power stage off by the host's controlword"
+DISABLED_BY_ANOTHER = "power stage off by another master's controlword"
 """Event of a switch-off by the host, at once or after a ramp. The end of a quick stop by the drive itself is no such
 event."""
 
@@ -207,6 +208,8 @@ class Application:
         self._time_s = 0.0
         self._fall: list[tuple[float, float]] = []      # time and magnitude of a falling speed setpoint
         self._by_host = False                       # the host has requested the state after the stop
+        self.foreign = False
+        """True while a request of another master is processed."""
         self._weighed: tuple[int, State] | None = None
         self._slow_for_s = 0.0
         self._in_window_s = 0.0
@@ -229,8 +232,8 @@ class Application:
         while self._obey(command):
             pass
         if was_on and not self.energised:
-            self.on_event(DISABLED_BY_HOST)
-        self._by_host = self._after_stop in {State.READY, State.SWITCHED_ON}
+            self.on_event(DISABLED_BY_ANOTHER if self.foreign else DISABLED_BY_HOST)
+        self._by_host = self._after_stop in {State.READY, State.SWITCHED_ON} and not self.foreign
         self._weighed = (word, self.state)
 
     def set_mode(self, code: int) -> bool:

@@ -48,7 +48,11 @@ class Scene:
     def foreign(self, can_id: int, data: bytes) -> None:
         """Send a frame of a third party: all nodes on the bus receive it, the drive among them."""
         self.put(can_id, data)
-        self.node.on_frame(can_id, data)
+        self.node.application.foreign = True
+        try:
+            self.node.on_frame(can_id, data)
+        finally:
+            self.node.application.foreign = False
 
 
 class Misbehaviour(Passing):

@@ -6,6 +6,7 @@ watchdog. A run is refused, uses another node number, or ends at standstill befo
 
 import pytest
 
+from tdhil.errors import ExitCode
 from tdhil.recording.log_reader import read_run
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
@@ -59,6 +60,8 @@ def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
     events = [event.text for event in read_run(run.log).events if event.kind == "bus"]
     assert events == ["another master wrote 6040h = 6h by SDO", "another master wrote 6060h = 4h by SDO"]
     assert run.shaft.at_rest_from() <= run.shaft.time_s[-1] - 1.0
+    rehearsal = run.done.document["rehearsal"]     # the drive was disabled in motion, and not by this host
+    assert (run.done.code, rehearsal["verdict"]) == (ExitCode.OK, "pass"), rehearsal["seen"]
     seen(61, f"reported at the end: {warnings}", None, run.assert_log_whole(), run.done.code)
 
 
