@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from tdhil.session.pace import PaceMeasured as PaceMeasured, measure_pace as measure_pace
     from tdhil.session.rehearsal import (
         ANY_FAULT as ANY_FAULT, REQUIRED as REQUIRED, Rehearsal as Rehearsal, RehearsalVerdict as RehearsalVerdict,
-        RequiredReaction as RequiredReaction, judge_rehearsal as judge_rehearsal,
+        RehearsedShaft as RehearsedShaft, RequiredReaction as RequiredReaction, judge_rehearsal as judge_rehearsal,
         required_reaction as required_reaction,
     )
     from tdhil.session.rig_text import (
@@ -98,7 +98,8 @@ else:
         "open_drive": "opened_drive plan_peer with_faults",
         "overrides": "UNVERIFIED_FLAG check_unverified doubtful is_accepted",
         "pace": "PaceMeasured measure_pace",
-        "rehearsal": "ANY_FAULT REQUIRED Rehearsal RehearsalVerdict RequiredReaction judge_rehearsal required_reaction",
+        "rehearsal": "ANY_FAULT REQUIRED Rehearsal RehearsalVerdict RehearsedShaft RequiredReaction judge_rehearsal "
+                     "required_reaction",
         "rig_text": "LIMIT_KEYS STRING_KEYS RigEntries blank_rig by_hand starter to_fill_in",
         "run_record": "RunRecord ByKeyword check_lags is_log read require_file trace_arguments "
                       "write_as_log",

@@ -202,17 +202,26 @@ def _row(fault: Scripted, kinds: Mapping[str, KnownFault]) -> int:
     return kinds[fault.name].row
 
 
+@dataclass(frozen=True)
+class RehearsedShaft:
+    """Motion of the simulated shaft, and the speed limit of the run.
+
+    ``missing``: reason why the motion is not known. Without it no rehearsal passes.
+    """
+
+    motion: TrueShaft | None = None
+    missing: str = ""
+    speed_max_rad_s: float = math.inf
+
+
 def judge_rehearsal(
     peer: PeerPlan, drive: str, outcome: RunOutcome, document: Mapping[str, Any] | None = None,
-    own_code: int | None = None, *, other_program: bool = False, shaft: TrueShaft | None = None,
-    untraced: str = "", speed_max_rad_s: float = math.inf,
+    own_code: int | None = None, *, other_program: bool = False, shaft: RehearsedShaft | None = None,
 ) -> Rehearsal:
     """Return the verdict on the faults of this run.
 
     ``document``: the result, None if the run ended early; ``own_code``: exit code of the result; ``other_program``:
-    the run has a virtual string or measures the drive's impedance; ``shaft``: motion of the simulated shaft, None
-    without a trace; ``untraced``: reason for a missing trace, without which no rehearsal passes; ``speed_max_rad_s``:
-    speed limit of the run.
+    the run has a virtual string or measures the drive's impedance; ``shaft``: None to judge by code and result alone.
     """
     from tdhil.buses import bus_named
 
@@ -233,14 +242,17 @@ def judge_rehearsal(
     short = any(math.isfinite(one.duration_s) for one in triggered)
     if short or 0 in allowed or any(one.or_covered for one in required):
         allowed |= {0, 9}                  # a result, or the statement that there is none
-    moved = None if shaft is None else _judge_shaft(peer, outcome, shaft, code, speed_max_rad_s)
+    motion, missing = (None, "") if shaft is None else (shaft.motion, shaft.missing)
+    moved = None
+    if shaft is not None and motion is not None:
+        moved = _judge_shaft(peer, outcome, motion, code, shaft.speed_max_rad_s)
     unsafe = moved is not None and bool(moved.broken)
     passed = code in allowed and covered is not False and not unsafe
     judged = tuple(
         RehearsedFault(
             one.text, row, REQUIRED.get(row, ANY_FAULT).words, REQUIRED.get(row, ANY_FAULT).codes,
             RehearsalVerdict.INCONCLUSIVE
-            if (by_hand and not unsafe) or (untraced and passed) or one.text in peer.never_came
+            if (by_hand and not unsafe) or (missing and passed) or one.text in peer.never_came
             else RehearsalVerdict.PASS if passed else RehearsalVerdict.FAIL,
         ) for one in peer.faults for row in (_row(one, kinds),)
     )
@@ -249,10 +261,10 @@ def judge_rehearsal(
                  if one in found)
     never = f". Not triggered: {', '.join(peer.never_came)}" if peer.never_came else ""
     seen = _seen(outcome, document, code, truth, covered)
-    if shaft is not None and moved is not None:
-        seen += _shaft_seen(shaft, moved)
-    if untraced:
-        seen += f"; the motion of the simulated shaft is not known ({untraced})"
+    if motion is not None and moved is not None:
+        seen += _shaft_seen(motion, moved)
+    if missing:
+        seen += f"; the motion of the simulated shaft is not known ({missing})"
     return Rehearsal(worst, seen + never, judged)
 
 

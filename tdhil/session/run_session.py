@@ -38,7 +38,7 @@ from tdhil.session.log_files import LogPlace
 from tdhil.session.open_drive import opened_drive
 from tdhil.session.overrides import accepted_lines, note, require_accepted
 from tdhil.session.real_time import real_time_priority
-from tdhil.session.rehearsal import Rehearsal, judge_rehearsal
+from tdhil.session.rehearsal import Rehearsal, RehearsedShaft, judge_rehearsal
 from tdhil.session.stop_signals import stop_on_signals
 from tdhil.session.stored_calibration import KEPT, calibration_of_rig, refuse_another_drive
 from tdhil.session.task import bench_of, excitation_request, facts, machine_limits, suited
@@ -254,8 +254,8 @@ class RunSession:
         bench = self.log.run.get("bench")
         self.rehearsal = judge_rehearsal(
             request.peer, request.connection.drive, outcome, document, code, other_program=bool(other),
-            shaft=self._shaft, untraced=self._untraced,
-            speed_max_rad_s=math.inf if bench is None else bench["limits"]["speed_max_rad_s"])
+            shaft=RehearsedShaft(
+                self._shaft, self._untraced, math.inf if bench is None else bench["limits"]["speed_max_rad_s"]))
         with suppress(LogError):
             self.log.configure(rehearsal=self.rehearsal.plain())
 

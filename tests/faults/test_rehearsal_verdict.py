@@ -14,7 +14,7 @@ from tdhil.recording import Stage
 from tdhil.report import card_text, rehearsal_of
 from tdhil.runner import RunOutcome
 from tdhil.runner.stop import StopReport
-from tdhil.session import ANY_FAULT, REQUIRED, judge_rehearsal
+from tdhil.session import ANY_FAULT, REQUIRED, RehearsedShaft, judge_rehearsal
 from tests.faults.rows import ROWS
 from tests.path.path_runs import identify, tdhil
 
@@ -30,8 +30,8 @@ HOLDS, MISSES = (
 def judged(*faults, cause=None, stop=STOPPED, document=None, code=None, never=(), shaft=None, untraced=""):
     bus = bus_named("canopen")
     peer = PeerPlan(True, True, 1, RigParams(), bus.parse_faults(faults), never_came=list(never))
-    return judge_rehearsal(peer, "canopen", RunOutcome(STAGES, cause, stop, None), document, code, shaft=shaft,
-                           untraced=untraced, speed_max_rad_s=10.0)
+    return judge_rehearsal(peer, "canopen", RunOutcome(STAGES, cause, stop, None), document, code,
+                           shaft=RehearsedShaft(shaft, untraced, 10.0))
 
 
 def shaft(speeds, *, on_until_s, disabled_s=()):
