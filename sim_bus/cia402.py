@@ -47,9 +47,10 @@ MODE_SPECIFIC = 0x1000
 
 
 DISABLED_BY_HOST = "power stage off by the host's controlword"
-DISABLED_BY_ANOTHER = "power stage off by another master's controlword"
 """Event of a switch-off by the host, at once or after a ramp. The end of a quick stop by the drive itself is no such
 event."""
+DISABLED_BY_ANOTHER = "power stage off by another master's controlword"
+"""Event of a switch-off at once by another master."""
 
 RAMP_SHARE, RAMP_TOLERANCE, RAMP_STEPS, RAMP_GAP_S = 0.35, 0.015, 16, 0.2
 """Definition of a stop by the speed setpoint: it falls in at least 15 steps, with gaps of at most 0.2 s, to 35 % of its

@@ -20,6 +20,7 @@ from profiles import MessageCode, TdhilError
 HEADER = "time_s,speed_rad_s,torque_nm,state,event\n"
 ROW_PERIOD_US = 10_000
 INCOMPLETE = ".part"
+"""Behind the name of a trace that could not be written to its end."""
 _FLUSH_S = 0.25
 
 

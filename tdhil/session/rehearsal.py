@@ -206,7 +206,7 @@ def _row(fault: Scripted, kinds: Mapping[str, KnownFault]) -> int:
 class RehearsedShaft:
     """Motion of the simulated shaft, and the speed limit of the run.
 
-    ``missing``: reason why the motion is not known. Without it no rehearsal passes.
+    ``missing``: reason why the motion is not known; a rehearsal that has one does not pass.
     """
 
     motion: TrueShaft | None = None
@@ -216,12 +216,13 @@ class RehearsedShaft:
 
 def judge_rehearsal(
     peer: PeerPlan, drive: str, outcome: RunOutcome, document: Mapping[str, Any] | None = None,
-    own_code: int | None = None, *, other_program: bool = False, shaft: RehearsedShaft | None = None,
+    own_code: int | None = None, *, other_program: bool = False, shaft: RehearsedShaft,
 ) -> Rehearsal:
     """Return the verdict on the faults of this run.
 
     ``document``: the result, None if the run ended early; ``own_code``: exit code of the result; ``other_program``:
-    the run has a virtual string or measures the drive's impedance; ``shaft``: None to judge by code and result alone.
+    the run has a virtual string or measures the drive's impedance. A ``shaft`` without motion and without a reason for
+    its absence leaves the verdict to code and result.
     """
     from tdhil.buses import bus_named
 
@@ -242,17 +243,15 @@ def judge_rehearsal(
     short = any(math.isfinite(one.duration_s) for one in triggered)
     if short or 0 in allowed or any(one.or_covered for one in required):
         allowed |= {0, 9}                  # a result, or the statement that there is none
-    motion, missing = (None, "") if shaft is None else (shaft.motion, shaft.missing)
-    moved = None
-    if shaft is not None and motion is not None:
-        moved = _judge_shaft(peer, outcome, motion, code, shaft.speed_max_rad_s)
+    moved = None if shaft.motion is None else _judge_shaft(
+        peer, outcome, shaft.motion, code, shaft.speed_max_rad_s)
     unsafe = moved is not None and bool(moved.broken)
     passed = code in allowed and covered is not False and not unsafe
     judged = tuple(
         RehearsedFault(
             one.text, row, REQUIRED.get(row, ANY_FAULT).words, REQUIRED.get(row, ANY_FAULT).codes,
             RehearsalVerdict.INCONCLUSIVE
-            if (by_hand and not unsafe) or (missing and passed) or one.text in peer.never_came
+            if (by_hand and not unsafe) or (shaft.missing and passed) or one.text in peer.never_came
             else RehearsalVerdict.PASS if passed else RehearsalVerdict.FAIL,
         ) for one in peer.faults for row in (_row(one, kinds),)
     )
@@ -261,10 +260,10 @@ def judge_rehearsal(
                  if one in found)
     never = f". Not triggered: {', '.join(peer.never_came)}" if peer.never_came else ""
     seen = _seen(outcome, document, code, truth, covered)
-    if motion is not None and moved is not None:
-        seen += _shaft_seen(motion, moved)
-    if missing:
-        seen += f"; the motion of the simulated shaft is not known ({missing})"
+    if shaft.motion is not None and moved is not None:
+        seen += _shaft_seen(shaft.motion, moved)
+    if shaft.missing:
+        seen += f"; the motion of the simulated shaft is not known ({shaft.missing})"
     return Rehearsal(worst, seen + never, judged)
 
 

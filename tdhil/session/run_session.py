@@ -7,7 +7,6 @@ The command line and the Python API both use it, so that guard, stop and confirm
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -46,7 +45,6 @@ from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from drivers import Identity, Preflight
-    from sim_bus import TrueShaft
     from tdhil.session.conclusion import Conclusion
     from tdhil.session.evaluation import EvaluationConclusion
     from tdhil.session.verification import VerificationConclusion
@@ -114,7 +112,7 @@ class RunSession:
 
     def __init__(self, request: RunRequest, operator_interface: OperatorInterface, *, report: bool = False) -> None:
         """Open the log only. ``report``: a report will be written, so its modules are loaded too."""
-        load_what_the_end_needs(report, case=request.case is not None)
+        load_what_the_end_needs(report, case=request.case is not None, rehearsal=bool(request.peer.faults))
         options, peer = request.options, request.peer
         self._request, self._operator_interface = request, operator_interface
         self._place = place = LogPlace(Path(options.log))
@@ -125,8 +123,7 @@ class RunSession:
             operator_interface.warn(f"another run writes {place.wanted}: the log of this run is {place.path}")
         self._older_shown = False
         self._outcome: RunOutcome | None = None
-        self._shaft: TrueShaft | None = None       # motion of the simulated shaft of a rehearsal
-        self._untraced = ""                        # reason for its absence
+        self._shaft = RehearsedShaft()
         self.rehearsal: Rehearsal | None = None
         """Verdict on the rehearsed faults, once the run has ended; None without faults."""
         self.log = RunLog(writer, configuration(request) | dict(request.stated))
@@ -195,28 +192,35 @@ class RunSession:
         """
         wanted, rehearsed = self._request.options.trace, bool(self._request.peer.faults)
         with ExitStack() as stack:
-            if rehearsed:               # loaded before motion
-                from sim_bus import read_shaft
             path = None if wanted is None else Path(wanted)
             if path is None and rehearsed:
                 try:
                     folder = stack.enter_context(TemporaryDirectory(prefix="tdhil-", ignore_cleanup_errors=True))
                     path = Path(folder) / "shaft.csv"
                 except OSError as error:
-                    self._untraced = f"no temporary folder: {error}"
+                    self._shaft = RehearsedShaft(missing=f"no temporary folder: {error}")
             try:
                 yield path
             finally:
-                if path is not None and path.is_file() and rehearsed:
-                    try:
-                        self._shaft = read_shaft(path)
-                    except (OSError, ValueError) as error:
-                        self._untraced = f"its trace cannot be read: {error}"
-                elif path is not None and not path.is_file() and self._outcome is not None:
-                    self._untraced = "its trace could not be written to the end"
-                    if wanted is not None:
-                        self._operator_interface.warn(
-                            f"tdhil: --trace {wanted}: the file could not be written to the end. Is the disk full?")
+                if path is not None and self._outcome is not None:
+                    self._shaft = self._rehearsed_shaft(path)
+
+    def _rehearsed_shaft(self, path: Path) -> RehearsedShaft:
+        """Return what the trace of a run that has ended shows. Warn if --trace has no whole file."""
+        options = self._request.options
+        if not path.is_file():
+            if options.trace is not None:
+                self._operator_interface.warn(
+                    f"tdhil: --trace {options.trace}: the file could not be written to the end. Is the disk full?")
+            return RehearsedShaft(missing="its trace could not be written to the end")
+        if not self._request.peer.faults:
+            return RehearsedShaft()
+        from sim_bus import read_shaft
+
+        try:
+            return RehearsedShaft(read_shaft(path))
+        except (OSError, ValueError) as error:
+            return RehearsedShaft(missing=f"its trace cannot be read: {error}")
 
     def _identify(self) -> Identify:
         """Return the function that identifies the recording during the run, as `conclude` does at its end."""
@@ -254,8 +258,8 @@ class RunSession:
         bench = self.log.run.get("bench")
         self.rehearsal = judge_rehearsal(
             request.peer, request.connection.drive, outcome, document, code, other_program=bool(other),
-            shaft=RehearsedShaft(
-                self._shaft, self._untraced, math.inf if bench is None else bench["limits"]["speed_max_rad_s"]))
+            shaft=self._shaft if bench is None else replace(
+                self._shaft, speed_max_rad_s=bench["limits"]["speed_max_rad_s"]))
         with suppress(LogError):
             self.log.configure(rehearsal=self.rehearsal.plain())
 
@@ -350,10 +354,10 @@ def configuration(request: RunRequest) -> dict[str, Any]:
     }
 
 
-def load_what_the_end_needs(report: bool, case: bool) -> None:
+def load_what_the_end_needs(report: bool, case: bool, rehearsal: bool) -> None:
     """Import the modules for stop and result before motion: later there may be no file descriptor left.
 
-    ``case``: the run compares a controller or its gains, instead of identifying.
+    ``case``: the run compares a controller or its gains, instead of identifying. ``rehearsal``: it has scripted faults.
     """
     import traceback  # noqa: F401
 
@@ -370,6 +374,8 @@ def load_what_the_end_needs(report: bool, case: bool) -> None:
 
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners at first use
+    if rehearsal:
+        from sim_bus import read_shaft  # noqa: F401
     if report:
         from tdhil.report import draw_run, require_extra  # noqa: F401
     if case:

@@ -103,6 +103,9 @@ def rules(limits: MachineLimits, still_rad_s: float, lag_s: float, point_s: floa
     return (TorqueAtLimitBeyondSetpoint(limits, still_rad_s, lag_s), FlatSpeedWithoutString(limits, still_rad_s), held)
 
 
+_ENCODER_OR_LOAD = "Check the encoder and its cable. Is the load as large as the torque limit?"
+
+
 def _strained(point: Point, limits: MachineLimits) -> bool:
     return abs(point.torque) >= AT_LIMIT_SHARE * limits.torque_nm
 
@@ -155,7 +158,7 @@ class _TorqueAtLimit:
             f"the torque has been at its limit for {self._longest_s:g} s ({in_nm(point.torque)}) while the reported"
             f" speed stays at {point.speed:.2f} rad/s, {self._where} the commanded"
             f" {command.speed_rad_s:.2f} rad/s",
-            "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
+            _ENCODER_OR_LOAD, point.time_s,
         )
 
     def _contradicts(self, now: PointInRun) -> bool:
@@ -215,13 +218,13 @@ class _FlatSpeed:
         self._low, self._high = low, high
         self._strained_s = self._strained_s + took_s if _strained(point, self._limits) else 0.0
         for_s = point.time_s - self._since_s
-        if not self._contradicts(now, for_s, took_s) or for_s <= 0.0 or abs(point.speed) <= self._least_rad_s:
+        if not self._contradicts(now, for_s, took_s) or abs(point.speed) <= self._least_rad_s:
             return None
         return Contradiction(
             frozenset({Signal.SPEED}),
             f"the reported speed has stayed at {point.speed:.2f} rad/s to within its noise for {for_s:.1f} s, while"
             f" the torque went to {in_nm(point.torque)}, which moves this shaft",
-            "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
+            _ENCODER_OR_LOAD, point.time_s,
         )
 
     def _begin(self, now: PointInRun) -> None:
