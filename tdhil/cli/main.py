@@ -76,6 +76,12 @@ _GROUPS: Final = {
 }
 """Commands in the groups of ``tdhil --help``, each with its one line."""
 _COMMANDS: Final = {name: summary for commands in _GROUPS.values() for name, summary in commands.items()}
+_INSTEAD: Final = {
+    "help": "tdhil --help", "version": "tdhil --version",
+    "run": "tdhil identify", "report": "tdhil replay run.mcap --report report.html",
+    "plot": "tdhil frf run.mcap --plot frf.png", "bode": "tdhil frf run.mcap --plot frf.png",
+}
+"""Words that other tools have as commands, each with the call that does this here."""
 
 
 process = SimpleNamespace(own=False)
@@ -98,8 +104,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             if chosen is not None and chosen == arguments[0] and chosen not in _COMMANDS:
                 from tdhil.cli.arguments import meant
 
+                advice = (f"Use {_INSTEAD[chosen]}" if chosen in _INSTEAD
+                          else f"{meant(chosen, _COMMANDS)}See tdhil --help")
                 raise UsageError(f"there is no command '{chosen[:40]}'", entry=MessageCode.UNKNOWN_COMMAND,
-                                 next_step=f"{meant(chosen, _COMMANDS)}See tdhil --help")
+                                 next_step=advice)
             parser = build_parser(chosen)
             parser.parse_args(arguments, namespace)
             if namespace.command is None:

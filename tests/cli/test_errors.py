@@ -18,7 +18,7 @@ from drivers.errors import (
     StopNotConfirmed,
     TdhilError,
 )
-from tdhil.cli.main import main
+from tdhil.cli.main import _INSTEAD, build_full_parser, main
 from tdhil.errors import ExitCode, Interrupted, UsageError, exit_code
 
 
@@ -129,12 +129,20 @@ def test_a_usage_error_is_a_document_if_json_is_requested(
     assert shown.err == f"tdhil: {error['message']} [{error['code']}]\n"
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("flet", "Did you mean 'fleet'? "), ("xyzzy", "")])
+@pytest.mark.parametrize(("typed", "advice"), [
+    ("flet", "Did you mean 'fleet'? See tdhil --help"), ("xyzzy", "See tdhil --help"),
+    ("report", "Use tdhil replay run.mcap --report report.html"), ("help", "Use tdhil --help"),
+])
 def test_an_unknown_command_is_reported_with_a_suggestion(
-    typed: str, meant: str, capsys: pytest.CaptureFixture[str]
+    typed: str, advice: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([typed, "logs"]) == 2
-    assert capsys.readouterr().err == f"tdhil: there is no command '{typed}'. {meant}See tdhil --help [TDH-201]\n"
+    assert capsys.readouterr().err == f"tdhil: there is no command '{typed}'. {advice} [TDH-201]\n"
+
+
+@pytest.mark.parametrize("call", sorted({one for one in _INSTEAD.values() if not one.startswith("tdhil --")}))
+def test_the_call_named_for_another_tool_s_command_is_one_of_ours(call: str) -> None:
+    build_full_parser().parse_args(call.split()[1:])
 
 
 @pytest.mark.parametrize(("typed", "said"), [
