@@ -34,6 +34,7 @@ from drawing import (  # noqa: E402
     RED,
     Axes,
     Drawing,
+    chosen,
 )
 
 IMAGES = ROOT / "docs" / "images"
@@ -375,4 +376,4 @@ def _svg(draw: Callable[[], Drawing]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(chosen(__doc__, (*RUN, *FORMULA, *GRAPHS, "card"), sys.argv[1:])))

@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT)]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+from drawing import chosen  # noqa: E402
 
 from tdhil.estimation import identify  # noqa: E402
 from tdhil.recording import Excitation, LagPrior, Recording, Segment  # noqa: E402
@@ -175,4 +177,4 @@ def main(names: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(chosen(__doc__, CASES, sys.argv[1:])))

@@ -23,6 +23,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
+from drawing import chosen  # noqa: E402
 from frequency_response import CASES, Machine, simulated  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
@@ -483,4 +484,4 @@ def main(names: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(chosen(__doc__, (*TEXTS, *PICTURES), sys.argv[1:])))
