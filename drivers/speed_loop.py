@@ -20,8 +20,8 @@ from drivers.preflight import PreflightTable
 from profiles import SpeedControllerParameters
 
 _UNITS: Mapping[str, str] = {
-    "nm_s_rad": " N·m·s/rad", "percent_per_percent": " %/%", "nm_rad": " N·m/rad", "s": " s", "ms": " ms", "hz": " Hz",
-    "unknown": ", unit unknown",
+    "nm_s_rad": " N·m·s/rad", "a_s_rad": " A·s/rad", "percent_per_percent": " %/%", "nm_rad": " N·m/rad", "s": " s",
+    "ms": " ms", "hz": " Hz", "unknown": ", unit unknown",
 }
 
 

@@ -100,9 +100,9 @@ class ControllerGain(ProfileEntry):
     """Proportional gain of the speed controller."""
 
     title: str = Field(min_length=3, description="the manual's number and name, such as 'p1470 P gain'")
-    unit: Literal["nm_s_rad", "percent_per_percent", "unknown"] = Field(
-        description="nm_s_rad: N·m per rad/s; percent_per_percent: torque in % of rated for a speed error in % of the "
-        "rated (or reference) speed; unknown: the manual gives none"
+    unit: Literal["nm_s_rad", "a_s_rad", "percent_per_percent", "unknown"] = Field(
+        description="nm_s_rad: N·m per rad/s; a_s_rad: A per rad/s; percent_per_percent: torque in % of rated for a "
+        "speed error in % of the rated (or reference) speed; unknown: the manual gives none"
     )
     parameter: ReadFrom = None
 

@@ -3,6 +3,7 @@ r"""Gains as values of the drive's own parameters, if its profile lists them. td
 ::
 
     N·m·s/rad             P, at the motor shaft
+    A·s/rad               P/K_t, with the motor's torque constant K_t, which no profile knows
     %/%                   P ω_r/T_r: torque in % of rated torque for a speed error in % of rated speed
     integral time         T_I = P/I
 
@@ -40,9 +41,12 @@ def drive_settings(
         return ()
     gain, integral = parameters.gain, parameters.integral
     value: float | None = None
-    why, unit = "", {"nm_s_rad": "N·m·s/rad", "percent_per_percent": "%/%", "unknown": "?"}[gain.unit]
+    why = ""
+    unit = {"nm_s_rad": "N·m·s/rad", "a_s_rad": "A·s/rad", "percent_per_percent": "%/%", "unknown": "?"}[gain.unit]
     if gain.unit == "nm_s_rad":
         value = at_motor.gain_nm_s_rad
+    elif gain.unit == "a_s_rad":
+        why = f"{at_motor.gain_nm_s_rad:.4g} N·m·s/rad divided by the motor's torque constant in N·m/A"
     elif gain.unit == "unknown":
         why = "its unit isn't known: look it up in the manual"
     elif rated_torque_nm is None or rated_speed_rpm is None:

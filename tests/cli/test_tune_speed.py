@@ -442,9 +442,9 @@ def test_the_impedance_in_the_result_itself_is_used(tuned, tmp_path):
 
 
 def test_a_profile_without_parameters_of_the_speed_loop_is_named_with_the_units(tuned):
-    _, text, _ = tuned(*LAGS, "--profile", "maxon/epos4", as_json=False)
+    _, text, _ = tuned(*LAGS, "--profile", "nanotec/c5-e", as_json=False)
     words = " ".join(text.split())
-    assert "The profile maxon/epos4 names no parameters of the speed loop for this drive. P is given in N·m" in words
+    assert "The profile nanotec/c5-e names no parameters of the speed loop for this drive. P is given in N·m" in words
     _, text, _ = tuned(*LAGS, as_json=False)
     assert "are not known without a profile. P is given in N·m·s/rad" in " ".join(text.split())
     assert max(map(len, text.splitlines())) <= 80

@@ -289,6 +289,7 @@ def parameters(gain, integral):
     ("nm_s_rad", "nm_rad", (1186.0, 999.3)),
     # 10 % of 1500 rpm is 15.708 rad/s. 1186 N·m·s/rad gives 18630 N·m for it, 186.3 % of 10 kN·m.
     ("percent_per_percent", "s", (18.63, 1186.0 / 999.3)),
+    ("a_s_rad", "s", (None, 1186.0 / 999.3)),
     ("unknown", "unknown", (None, None)),
 ])
 def test_gains_in_the_drives_own_units(gain, integral, values):
@@ -304,7 +305,9 @@ def test_a_share_needs_the_name_plate():
     assert drive_settings(None, SOFT_025) == ()
 
 
-@pytest.mark.parametrize("name", ["siemens/s120-canopen", "siemens/g120", "abb/acs880-enhanced"])
+@pytest.mark.parametrize("name", [
+    "siemens/s120-canopen", "siemens/g120", "abb/acs880-enhanced", "beckhoff/ax8000", "kollmorgen/akd", "maxon/epos4",
+    "danfoss/fc302", "yaskawa/ga700", "elmo/gold"])
 def test_profiles_with_a_speed_controller_need_no_question_before_a_run(name):
     profile = load_profile(name)
     assert profile.speed_controller is not None

@@ -206,7 +206,8 @@ def test_the_stop_of_a_run_without_its_folder_states_that_it_was_signalled(page,
     page.get_by_role("button", name="Stop", exact=True).click()
     page.get_by_text("SIGTERM was sent to its process").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
-    wait_for("the end of the run", lambda: run not in served.service.supervisor.live())     # the fixture needs the folder
+    live = served.service.supervisor.live
+    wait_for("the end of the run", lambda: run not in live())   # the fixture needs the folder of a live run
 
 
 def test_the_time_left_of_a_simulated_run_is_in_real_time(page, served):
