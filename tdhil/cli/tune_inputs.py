@@ -367,6 +367,8 @@ def _reported_gains(
             integral = gain / time_s
     if "unknown" in units:
         return None, f"{source}; the profile does not know their units"
+    if "a_s_rad" in units:
+        return None, f"{source}; P in A·s/rad needs the motor's torque constant. State both with --present"
     return _comparable(float(gain or 0.0), float(integral or 0.0), source)
 
 

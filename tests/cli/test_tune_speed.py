@@ -194,6 +194,7 @@ PERCENT = {"gain": None, "integral": None, "units": ("percent_per_percent", "ms"
     # 10 %/% of 600 N·m and 1500 rpm = 157.08 rad/s: 38.197 N·m·s/rad; over 2 s.
     (("--rated-torque", "600", "--rated-speed", "1500"), PERCENT, (38.197, 19.099), "(2101h, 2102h)"),
     ((), {"gain": None, "integral": None, "units": ("unknown", "ms")}, None, "the profile does not know their units"),
+    ((), {"gain": None, "integral": None, "units": ("a_s_rad", "ms")}, None, "needs the motor's torque constant"),
     ((), {"integral": 0.0, "values": (40.0, 0.0)}, None, "P or I is 0"),
     ((), {"integral": None, "values": (40.0, None)}, None, "the drive did not report both gains"),
     ((), {"confidence": "unverified"}, (40.0, 30.0), "in units that the profile marks as unverified"),

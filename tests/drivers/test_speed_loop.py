@@ -109,6 +109,7 @@ def read(values, gain="nm_s_rad", integral="s", smoothing="s", simulated=True, *
     (("nm_s_rad", "s", "hz"), (40.0, 0.0, 0.0), (40.0, 0.0, 0.0)),              # no integral part, no filter
     (("percent_per_percent", "s", "s"), (10.0, 0.5, 0.02), (None, None, 0.02)),
     (("percent_per_percent", "nm_rad", "s"), (10.0, 80.0, 0.02), (None, 80.0, 0.02)),
+    (("a_s_rad", "s", "s"), (10.0, 0.5, 0.02), (None, None, 0.02)),
     (("unknown", "unknown", "unknown"), (10.0, 0.5, 3.0), (None, None, None)),
     (("nm_s_rad", "s", "s"), (None, 0.5, None), (None, None, None)),
     (("nm_s_rad", "s", "s"), (-1.0, math.nan, math.inf), (None, None, None)),
