@@ -118,6 +118,12 @@ def _by_hand(profile: Profile, console: Console) -> None:
         for one in written:
             table.add_row(one.title, str(one.set_to).replace("_", " "))
         console.print(table)
+    if (loop := profile.speed_controller) is not None:
+        table = _table("speed loop, for the gains of tdhil tune; no run writes them", "parameter", "confidence")
+        for entry in (loop.gain, loop.integral, loop.filter, *loop.notch):
+            if entry is not None:
+                table.add_row(entry.title, MARKS[entry.confidence])
+        console.print(table)
 
 
 def _advice(one: Any, untold: bool) -> str:

@@ -37,6 +37,8 @@ def test_a_page_is_complete(name, monkeypatch):
         assert one.title in done.out
         if one.require is not None and one.advice:
             assert one.advice in done.out
+    if (loop := profile.speed_controller) is not None:
+        assert all(one.title in done.out for one in (loop.gain, loop.integral, *loop.notch))
     for hint in profile.hints:
         assert hint in done.out
     for level in ("likely", "unverified"):
