@@ -13,7 +13,12 @@ import pytest
 from profiles import CodedText, MessageCode, UsageError
 from tdhil.estimation import Options, identify, response_columns, unit_of, usable_samples
 from tdhil.estimation.case import Case
-from tdhil.estimation.frequency_domain.frequency_response import _pooled, distortion_warning, measure_response
+from tdhil.estimation.frequency_domain.frequency_response import (
+    _between_speeds,
+    _pooled,
+    distortion_warning,
+    measure_response,
+)
 from tdhil.estimation.periodic import measured
 from tdhil.estimation.spectrum import SpectralLine
 from tests.estimation.analytic import closed_form
@@ -258,6 +263,14 @@ def test_the_signal_with_less_noise_is_the_divisor():
         seen.append(1.0 / _pooled(line).z)
     error = np.array(seen) - 1.0 / z
     assert abs(error.mean()) < 4.0 * np.std(error) / math.sqrt(len(seen))
+
+
+def test_a_line_whose_periods_depend_on_each_other_does_not_show_a_difference_between_mean_speeds():
+    """Noise that outlasts a period has a mean that scatters more than its scatter over the periods shows."""
+    speed, torque = np.array([1.0 + 0j, 1.0]), np.array([100.0 + 0j, 101.0])
+    line = SpectralLine(0.3, speed, torque, np.array([6.0, 6.0]), 1e-8, 0.01, 0j, 10.0)
+    assert _between_speeds([_pooled(line)]) < 1e-6
+    assert _between_speeds([_pooled(replace(line, independent=False))]) is None
 
 
 @pytest.mark.heavy

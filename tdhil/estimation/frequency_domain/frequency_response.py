@@ -384,13 +384,16 @@ def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tu
 
 
 def _between_speeds(lines: list[_PooledLine]) -> float | None:
-    """Return the p-value of one Z at all mean speeds; None for a single mean speed."""
+    """Return the p-value of one Z at all mean speeds; None for a single mean speed.
+
+    The scatter of dependent periods is not that of their mean, so that such lines do not count.
+    """
     from scipy.special import chdtrc
 
     statistic, freedom, each = 0.0, 0.0, []
     for one in lines:
         more = len(one.line.speed) - 1
-        if more < 1 or not one.line.excited:
+        if more < 1 or not (one.line.excited and one.line.independent):
             continue
         left = one.line.torque - one.z * one.line.speed
         q = float(np.sum(one.line.periods * np.abs(left) ** 2)) / one.variance

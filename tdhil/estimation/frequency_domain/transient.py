@@ -45,6 +45,7 @@ _DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)   # decays tried, per period
 _LEAST_DECAY = 0.02          # of ln x over a period: a slower decay is drift, which the ends of the periods correct
 _STEPS = (0.2, 0.03)         # first steps of a descent: of ln(decay), of frequency over the lowest line's
 _ROUNDING = 1e-12         # least relative variance: below it is rounding
+_OUTLASTS = 1.0           # decay of ln x per period, below which an oscillation links the noise of successive periods
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def settled_lines(
     swings = [segment.swing(modes) for segment in segments]
     rounding = mean_rounding(fits)       # it repeats in each period, so that the scatter does not show it
     return tuple(
-        _line(hertz, column, segments, swings, len(modes), rounding) for column, hertz in enumerate(fits[0].lines_hz))
+        _line(hertz, column, segments, swings, modes, rounding) for column, hertz in enumerate(fits[0].lines_hz))
 
 
 def _segment(fit: PeriodLines, torque: ComplexArray, stretch: Stretch, viscous: float) -> _ScaledSegment:
@@ -228,8 +229,8 @@ def _refined(segments: Sequence[_ScaledSegment], modes: tuple[complex, ...]) -> 
 
 
 def _line(
-    hertz: float, column: int, segments: Sequence[_ScaledSegment], swings: Sequence[_ModeShare], modes: int,
-    rounding: FloatArray,
+    hertz: float, column: int, segments: Sequence[_ScaledSegment], swings: Sequence[_ModeShare],
+    modes: Sequence[complex], rounding: FloatArray,
 ) -> SpectralLine:
     nu, means, counts = 0.0, [], []
     scatter = np.zeros((2, 2), dtype=np.complex128)
@@ -241,9 +242,19 @@ def _line(
         counts.append(1.0 / (1.0 / periods + float(np.max(swing.uncertain[:, column]))))
         nu += periods - 1.0 - float(np.max(swing.fitted[:, column]))
     # σ is fitted as well: two real numbers a mode, common to all lines and both signals.
-    nu = max(1.0, nu - modes / (2.0 * len(segments[0].omega)))
+    nu = max(1.0, nu - len(modes) / (2.0 * len(segments[0].omega)))
     speed, torque = np.array(means).T
     covariance = scatter / nu
     s_ww, s_tt = (float(covariance[k, k].real) + float(rounding[k]) + FLOOR * float(np.max(np.abs(means) ** 2))
                   for k, means in enumerate((speed, torque)))
-    return SpectralLine(hertz, speed, torque, np.array(counts), s_ww, s_tt, complex(covariance[1, 0]), nu)
+    return SpectralLine(hertz, speed, torque, np.array(counts), s_ww, s_tt, complex(covariance[1, 0]), nu,
+                        not _lasts_near(hertz, modes, segments[0].period_s))
+
+
+def _lasts_near(hertz: float, modes: Sequence[complex], period_s: float) -> bool:
+    """Return whether a mode outlasts a period within a step 1/P of the line, the resolution of a period.
+
+    Noise drives the mode too. The line contains it, and its amplitude continues into the next periods.
+    """
+    return any(-mode.real * period_s < _OUTLASTS and abs(mode.imag / (2.0 * np.pi) - hertz) * period_s < 1.0
+               for mode in modes)
