@@ -195,7 +195,7 @@ class SpectralLine:
     """One spectral line: M segment means and the pooled covariance of a single period.
 
     ``speed``, ``torque`` (M,) complex; ``periods`` (M,) whole numbers; ``nu`` complex degrees of freedom.
-    ``independent``: False if an oscillation that outlasts a period is too near the line to be separated from it.
+    ``oscillation_steps``: distance to the nearest oscillation that outlasts a period P, in steps of 1/P.
     """
 
     hertz: float
@@ -206,7 +206,7 @@ class SpectralLine:
     s_tt: float
     s_tw: complex             # E T W*
     nu: float
-    independent: bool = True
+    oscillation_steps: float = np.inf
 
     @property
     def excited(self) -> bool:

@@ -265,12 +265,14 @@ def test_the_signal_with_less_noise_is_the_divisor():
     assert abs(error.mean()) < 4.0 * np.std(error) / math.sqrt(len(seen))
 
 
-def test_a_line_whose_periods_depend_on_each_other_does_not_show_a_difference_between_mean_speeds():
-    """Noise that outlasts a period has a mean that scatters more than its scatter over the periods shows."""
+def test_a_line_beside_an_oscillation_is_wider_and_does_not_show_a_difference_between_mean_speeds():
+    """An oscillation that outlasts a period has a mean that scatters more than its scatter over the periods shows."""
     speed, torque = np.array([1.0 + 0j, 1.0]), np.array([100.0 + 0j, 101.0])
     line = SpectralLine(0.3, speed, torque, np.array([6.0, 6.0]), 1e-8, 0.01, 0j, 10.0)
     assert _between_speeds([_pooled(line)]) < 1e-6
-    assert _between_speeds([_pooled(replace(line, independent=False))]) is None
+    beside, apart = (_pooled(replace(line, oscillation_steps=steps)) for steps in (0.2, 0.9))
+    assert _between_speeds([beside]) is None and _between_speeds([apart]) is None
+    assert beside.noise_rel > 2.5 * apart.noise_rel and apart.noise_rel == _pooled(line).noise_rel
 
 
 @pytest.mark.heavy

@@ -112,6 +112,9 @@ DETECTED_P = 0.001
 LEAST_SETS = 4
 """Least number of sets of phases whose scatter is taken for that of the distortion: six degrees of freedom."""
 
+_RESOLVED_STEPS = 1.0    # distance of a line and an oscillation that a period separates, in steps of 1/P
+_BESIDE_STEPS = 0.25     # distance below which the mean of a line scatters more than its periods show (decision 0099)
+_BESIDE_VARIANCE = 8.0   # factor of its variance there (decision 0099)
 _MOST_HARMONICS = 12     # most unexcited harmonics tested
 _BEYOND = 3              # times the highest excited harmonic: end of third-order distortion
 _SAMPLES_A_CYCLE = 8     # fewest samples per cycle of an unexcited harmonic
@@ -190,7 +193,8 @@ def _pooled(line: SpectralLine) -> _PooledLine | None:
     alone = line.s_tt + abs(z) ** 2 * line.s_ww
     variance = max(alone - 2.0 * (z.conjugate() * line.s_tw).real, 1e-12 * alone)
     energy = weight_w if by_speed else weight_t / abs(z) ** 2
-    return _PooledLine(line, z, variance, energy, math.sqrt(variance / (2.0 * energy)) / abs(z))
+    beside = _BESIDE_VARIANCE if line.oscillation_steps < _BESIDE_STEPS else 1.0
+    return _PooledLine(line, z, variance, energy, math.sqrt(beside * variance / (2.0 * energy)) / abs(z))
 
 
 def _straight(lines: list[_PooledLine]) -> _StraightLine:
@@ -386,14 +390,14 @@ def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tu
 def _between_speeds(lines: list[_PooledLine]) -> float | None:
     """Return the p-value of one Z at all mean speeds; None for a single mean speed.
 
-    The scatter of dependent periods is not that of their mean, so that such lines do not count.
+    Lines that a period does not separate from an oscillation do not count.
     """
     from scipy.special import chdtrc
 
     statistic, freedom, each = 0.0, 0.0, []
     for one in lines:
         more = len(one.line.speed) - 1
-        if more < 1 or not (one.line.excited and one.line.independent):
+        if more < 1 or not one.line.excited or one.line.oscillation_steps < _RESOLVED_STEPS:
             continue
         left = one.line.torque - one.z * one.line.speed
         q = float(np.sum(one.line.periods * np.abs(left) ** 2)) / one.variance

@@ -45,7 +45,7 @@ _DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)   # decays tried, per period
 _LEAST_DECAY = 0.02          # of ln x over a period: a slower decay is drift, which the ends of the periods correct
 _STEPS = (0.2, 0.03)         # first steps of a descent: of ln(decay), of frequency over the lowest line's
 _ROUNDING = 1e-12         # least relative variance: below it is rounding
-_OUTLASTS = 1.0           # decay of ln x per period, below which an oscillation links the noise of successive periods
+_OUTLASTS = 1.0           # decay of ln x per period, below which an oscillation outlasts the period
 
 
 @dataclass(frozen=True)
@@ -248,13 +248,13 @@ def _line(
     s_ww, s_tt = (float(covariance[k, k].real) + float(rounding[k]) + FLOOR * float(np.max(np.abs(means) ** 2))
                   for k, means in enumerate((speed, torque)))
     return SpectralLine(hertz, speed, torque, np.array(counts), s_ww, s_tt, complex(covariance[1, 0]), nu,
-                        not _lasts_near(hertz, modes, segments[0].period_s))
+                        _oscillation_steps(hertz, modes, segments[0].period_s))
 
 
-def _lasts_near(hertz: float, modes: Sequence[complex], period_s: float) -> bool:
-    """Return whether a mode outlasts a period within a step 1/P of the line, the resolution of a period.
+def _oscillation_steps(hertz: float, modes: Sequence[complex], period_s: float) -> float:
+    """Return the distance to the nearest mode that outlasts a period, in steps of 1/P; inf without one.
 
-    Noise drives the mode too. The line contains it, and its amplitude continues into the next periods.
+    Noise drives such a mode too, and its amplitude continues into the next periods.
     """
-    return any(-mode.real * period_s < _OUTLASTS and abs(mode.imag / (2.0 * np.pi) - hertz) * period_s < 1.0
-               for mode in modes)
+    return min((abs(mode.imag / (2.0 * np.pi) - hertz) * period_s for mode in modes
+                if -mode.real * period_s < _OUTLASTS), default=np.inf)
