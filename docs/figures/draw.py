@@ -21,6 +21,7 @@ from scipy.optimize import least_squares
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
+from chosen_names import chosen  # noqa: E402
 from drawing import (  # noqa: E402
     BLUE,
     GREEN,
@@ -34,7 +35,6 @@ from drawing import (  # noqa: E402
     RED,
     Axes,
     Drawing,
-    chosen,
 )
 
 IMAGES = ROOT / "docs" / "images"

@@ -20,7 +20,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
-from drawing import chosen  # noqa: E402
+from chosen_names import chosen  # noqa: E402
 
 from tdhil.estimation import identify  # noqa: E402
 from tdhil.recording import Excitation, LagPrior, Recording, Segment  # noqa: E402

@@ -23,7 +23,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
-from drawing import chosen  # noqa: E402
+from chosen_names import chosen  # noqa: E402
 from frequency_response import CASES, Machine, simulated  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
