@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from tdhil.service.access import Access
 from tdhil.service.audit import Audit
 from tdhil.service.limits import API
 from tdhil.service.run_channel import RunRefused
-from tdhil.service.run_state import Told, disk_full
+from tdhil.service.run_state import FolderMissing, NotThere, Told, disk_full
 from tdhil.service.start_request import Rigs
 from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor
@@ -145,8 +146,10 @@ def service(tmp_path: Path, rigs: Path) -> Iterator[Service]:
     found = Service(tmp_path / "data", rigs)
     yield found
     for run in found.supervisor.live():
-        (found.store.place(run) / "rest").touch()       # a braking run (`fake_run`) would not end
-        found.supervisor.stop(run, "end of the test")
+        with suppress(NotThere):                            # a run may have lost its folder
+            (found.store.place(run) / "rest").touch()       # a braking run (`fake_run`) would not end
+        with suppress(NotThere, FolderMissing):
+            found.supervisor.stop(run, "end of the test")
     found.supervisor.close()
 
 

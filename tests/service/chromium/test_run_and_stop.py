@@ -207,7 +207,7 @@ def test_the_stop_of_a_run_without_its_folder_states_that_it_was_signalled(page,
     page.get_by_text("SIGTERM was sent to its process").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
     live = served.service.supervisor.live
-    wait_for("the end of the run", lambda: run not in live())   # the fixture needs the folder of a live run
+    wait_for("the end of the run", lambda: run not in live())
 
 
 def test_the_time_left_of_a_simulated_run_is_in_real_time(page, served):
