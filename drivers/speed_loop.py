@@ -17,13 +17,7 @@ from typing import NamedTuple
 from drivers.drive import ReportedSetting, SpeedLoopPresent
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.preflight import PreflightTable
-from profiles import SpeedControllerParameters
-
-_UNITS: Mapping[str, str] = {
-    "nm_s_rad": " N·m·s/rad", "a_s_rad": " A·s/rad", "percent_per_percent": " %/%", "nm_rad": " N·m/rad", "s": " s",
-    "ms": " ms", "hz": " Hz", "unknown": ", unit unknown",
-}
-
+from profiles import CONTROLLER_UNITS, SpeedControllerParameters
 
 _SECONDS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3}
 
@@ -59,7 +53,8 @@ def read_speed_loop(
         if not math.isfinite(value) or value < 0.0:
             table.note(f"speed loop: {part}", f"{value:g} is not a valid setting, and is not used", place)
             continue
-        table.note(f"speed loop: {part}", f"{value:.6g}{_UNITS[entry.unit]}", place)
+        unit = f" {CONTROLLER_UNITS[entry.unit]}" if entry.unit in CONTROLLER_UNITS else ", unit unknown"
+        table.note(f"speed loop: {part}", f"{value:.6g}{unit}", place)
         found[part] = ReportedSetting(entry.title, place, raw, value, entry.unit, entry.confidence)
     return in_si(found.get("gain"), found.get("integral"), found.get("filter"))
 

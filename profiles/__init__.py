@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     from profiles.eds_reader import read_eds as read_eds
     from profiles.entry import (
         Confidence as Confidence, DriveProfile as DriveProfile, ProfileEntry as ProfileEntry, Require as Require,
-        NotchParameter as NotchParameter, SpeedControllerParameters as SpeedControllerParameters,
+        CONTROLLER_UNITS as CONTROLLER_UNITS, NotchParameter as NotchParameter,
+        SpeedControllerParameters as SpeedControllerParameters,
         unit_text as unit_text, with_unit as with_unit,
     )
     from profiles.errors import (
@@ -45,8 +46,8 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, {
         "eds_import": "begin_profile",
         "eds_reader": "read_eds",
-        "entry": "Confidence DriveProfile NotchParameter ProfileEntry Require SpeedControllerParameters unit_text "
-                 "with_unit",
+        "entry": "CONTROLLER_UNITS Confidence DriveProfile NotchParameter ProfileEntry Require "
+                 "SpeedControllerParameters unit_text with_unit",
         "errors": "DataFileError Problem TdhilError UsageError",
         "library": "Profile eds_path load_canopen_profile load_ethercat_profile load_modbus_profile load_profile "
                    "matching_names parse_profile profile_names profile_text",

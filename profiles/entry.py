@@ -96,6 +96,13 @@ ReadFrom = Annotated[str | None, Field(
 )]
 
 
+CONTROLLER_UNITS = {
+    "nm_s_rad": "N·m·s/rad", "a_s_rad": "A·s/rad", "percent_per_percent": "%/%", "nm_rad": "N·m/rad", "s": "s",
+    "ms": "ms", "hz": "Hz",
+}
+"""Text of each known unit of the speed controller's parameters."""
+
+
 class ControllerGain(ProfileEntry):
     """Proportional gain of the speed controller."""
 

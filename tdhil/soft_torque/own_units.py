@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 
-from profiles import NotchParameter, SpeedControllerParameters
+from profiles import CONTROLLER_UNITS, NotchParameter, SpeedControllerParameters
 from tdhil.soft_torque.controller import SpeedController
 
 
@@ -41,8 +41,7 @@ def drive_settings(
         return ()
     gain, integral = parameters.gain, parameters.integral
     value: float | None = None
-    why = ""
-    unit = {"nm_s_rad": "N·m·s/rad", "a_s_rad": "A·s/rad", "percent_per_percent": "%/%", "unknown": "?"}[gain.unit]
+    why, unit = "", CONTROLLER_UNITS.get(gain.unit, "?")
     if gain.unit == "nm_s_rad":
         value = at_motor.gain_nm_s_rad
     elif gain.unit == "a_s_rad":
@@ -57,7 +56,7 @@ def drive_settings(
     time_s = at_motor.gain_nm_s_rad / at_motor.integral_nm_rad
     number = {"s": time_s, "ms": 1e3 * time_s, "nm_rad": at_motor.integral_nm_rad}.get(integral.unit)
     why = "" if number is not None else "its unit isn't known: look it up in the manual"
-    unit = {"s": "s", "ms": "ms", "nm_rad": "N·m/rad", "unknown": "?"}[integral.unit]
+    unit = CONTROLLER_UNITS.get(integral.unit, "?")
     return proportional, DriveSetting(integral.title, number, unit, integral.source, integral.confidence, why)
 
 
