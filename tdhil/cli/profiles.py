@@ -118,7 +118,7 @@ def _by_hand(profile: Profile, console: Console) -> None:
         for one in written:
             table.add_row(one.title, str(one.set_to).replace("_", " "))
         console.print(table)
-    if (loop := profile.speed_controller) is not None:
+    if (loop := profile.speed_controller) is not None and loop.belongs_to(simulated=False):
         table = _table("speed loop, for the gains of tdhil tune; no run writes them", "parameter", "confidence")
         for entry in (loop.gain, loop.integral, loop.filter, *loop.notch):
             if entry is not None:

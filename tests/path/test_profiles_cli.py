@@ -39,6 +39,7 @@ def test_a_page_is_complete(name, monkeypatch):
             assert one.advice in done.out
     if (loop := profile.speed_controller) is not None:
         assert all(one.title in done.out for one in (loop.gain, loop.integral, *loop.notch))
+    assert ("for the gains of tdhil tune" in done.out) is (loop is not None and not loop.simulated_only)
     for hint in profile.hints:
         assert hint in done.out
     for level in ("likely", "unverified"):
