@@ -112,7 +112,7 @@ DETECTED_P = 0.001
 LEAST_SETS = 4
 """Least number of sets of phases whose scatter is taken for that of the distortion: six degrees of freedom."""
 
-_RESOLVED_STEPS = 1.0    # distance of a line and an oscillation that a period separates, in steps of 1/P
+_RESOLVED_STEPS = 1.0    # distance from an oscillation that a period separates, in steps of 1/P (decision 0099)
 _BESIDE_STEPS = 0.25     # distance below which the mean of a line scatters more than its periods show (decision 0099)
 _BESIDE_VARIANCE = 8.0   # factor of its variance there (decision 0099)
 _MOST_HARMONICS = 12     # most unexcited harmonics tested
@@ -388,7 +388,7 @@ def _harmonics(lines_hz: tuple[float, ...], period_s: float, samples: int) -> tu
 
 
 def _between_speeds(lines: list[_PooledLine]) -> float | None:
-    """Return the p-value of one Z at all mean speeds; None for a single mean speed.
+    """Return the p-value of one Z at all mean speeds; None for a single mean speed, or without a line that counts.
 
     Lines that a period does not separate from an oscillation do not count.
     """

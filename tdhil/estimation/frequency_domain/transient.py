@@ -45,7 +45,7 @@ _DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)   # decays tried, per period
 _LEAST_DECAY = 0.02          # of ln x over a period: a slower decay is drift, which the ends of the periods correct
 _STEPS = (0.2, 0.03)         # first steps of a descent: of ln(decay), of frequency over the lowest line's
 _ROUNDING = 1e-12         # least relative variance: below it is rounding
-_OUTLASTS = 1.0           # decay of ln x per period, below which an oscillation outlasts the period
+_OUTLASTS = 1.0           # decay of ln x per period, below which an oscillation outlasts it (decision 0099)
 
 
 @dataclass(frozen=True)
